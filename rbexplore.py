@@ -1,0 +1,1290 @@
+"""RbExplore, as its paper says it: Ugadiarov, Skrynnik, Panov, "Long-Term Exploration in Persistent MDPs".
+
+The agent explores without rewards. It rolls back to stored snapshots of the environment, clusters the states
+that it meets by a learned similarity R, and starts again from rarely visited clusters. An iteration has five
+steps (section 4), the five calls of `RbExplore.iterate`:
+
+    1  explore            sample M clusters of G, roll back to each, walk with pi_explore
+    2  make_pairs         label pairs of states; walk on from L novel states for more pairs; prefixes
+    3  train_similarity   train R on the pairs of this iteration
+    4  update_graph       add the states of step 1 to G; every 15th iteration, merge similar clusters
+    5  train_novelty      train the novelty module (RND) on the states of step 1
+
+    symbol              here                        meaning
+    s, snap             frame, snapshot             a state: its observation, and the simulator's saved bytes
+    tau                 Trajectory                  states s_1 ... s_T that follow one another
+    pi_explore          walk                        uniform over the actions
+    R(s_1, s_2)         SimilarityModel             in [0, 1]: are the two states close in time?
+    n, N                Config.n, .N                closer than n steps: similar; more than N apart: dissimilar
+    G = (V, E)          Graph.clusters, .arcs       clusters, and the arcs between them
+    v = (s, snap)       Cluster                     a cluster is its centre
+    E_parent, prefix    Cluster.parent, .path       the cluster that v came from; the states in between
+    theta_sim, _merge   Config.theta_sim, ...       thresholds on R: to join a cluster; to merge two
+    B, beta, L          novel, Config.beta, .L      novel states; what is novel; how many of them are sampled
+    M                   Config.M                    exploration trajectories an iteration
+
+"S4.2-03" is a statement of the paper and names its test; "R13" is our reading where the paper is silent or
+unclear. The README lists both.
+"""
+
+import argparse
+import copy
+import functools
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import pathlib
+import platform
+import signal
+import sys
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, fields, replace
+
+import gymnasium
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from envs import InputError, check_contract, make_env
+
+# ---------------------------------------------------------------------------- configuration (6.1; S6.1-05, 08, 09, 12)
+
+
+def option(default, meaning, low=None, high=None, choices=None):
+    """A field of the configuration: its meaning is the text of --help, its range is checked."""
+    return field(default=default, metadata={"meaning": meaning, "low": low, "high": high, "choices": choices})
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's configuration: the defaults are its values, the same for every level. A step is an agent step:
+    one action, after the frameskip (R1). Raises InputError for a value that cannot work."""
+
+    seed: int = option(0, "every generator is made from it", 0)
+    steps: int = option(15_000_000, "agent steps in all: exploration, additional, pretraining (6.2, R2)", 1)
+    pretrain_steps: int = option(500_000, "steps of pretraining; then G is reset (6.1)", 0)
+    M: int = option(30, "exploration trajectories an iteration (6.1)", 1)
+    trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
+    trim: int = option(0, "last states of a trajectory that G ignores (R10)", 0)
+    L: int = option(1000, "novel states to walk on from, at most, an iteration (6.1)", 0)
+    additional_steps: int = option(50, "longest additional trajectory, steps (R3)", 1)
+    beta: float = option(2.5, "a state is novel above this intrinsic reward, standard deviations (6.1, R4)")
+    novelty_window: int = option(5, "latest iterations whose errors standardise the reward (R4)", 1)
+    keep_buffer: bool = option(False, "keep the novel states of earlier iterations in B (R5)")
+    n: int = option(5, "pairs closer than this are similar, steps (6.1)", 1)
+    N: int = option(25, "pairs further apart than this are dissimilar, steps (6.1)", 1)
+    prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: the ablation of 6.3)")
+    epochs: int = option(4, "passes of R over the pairs of an iteration (R19)", 1)
+    replay_iterations: int = option(0, "earlier iterations whose pairs R trains on again (R19)", 0)
+    theta_sim: float = option(0.5, "a state joins a cluster above this R (6.1)", 0, 1)
+    theta_merge: float = option(0.5, "two clusters merge above this R (6.1)", 0, 1)
+    merge: bool = option(True, "merge clusters (4.2; off: the ablation of 6.3)")
+    merge_every: int = option(15, "iterations from one merge to the next (6.1)", 1)
+    max_clusters: int = option(0, "make no cluster beyond so many; 0: no bound, as in the paper", 0)
+    frame_size: int = option(96, "height and width of an observation, pixels (5)", 32)
+    encoder: str = option("resnet18", "network that embeds a frame for R (6.1)", choices=("resnet18", "small"))
+    embedding: int = option(512, "size of a frame's embedding (6.1)", 1)
+    head_width: int = option(512, "width of R's fully connected layers (R20)", 1)
+    r_learning_rate: float = option(1e-4, "Adam's, for R (R18)", 0)
+    r_batch: int = option(256, "pairs in a batch (R18)", 2)
+    r_clip: float = option(1.0, "bound on the norm of R's gradient (R18)", 0)
+    rnd_encoder: str = option("nature", "network of RND (R18)", choices=("nature", "small"))
+    rnd_features: int = option(512, "size of RND's output (R18)", 1)
+    rnd_learning_rate: float = option(1e-4, "Adam's, for RND (R18)", 0)
+    rnd_batch: int = option(256, "states in a batch (R18)", 1)
+
+    def __post_init__(self):
+        for f in fields(self):
+            name, value, low, high = f.name, getattr(self, f.name), f.metadata["low"], f.metadata["high"]
+            if isinstance(value, bool) != (f.type is bool) or not isinstance(value, (int, f.type) if f.type is float else f.type):
+                raise InputError(f"{name} is {value!r}: it must be of type {f.type.__name__}")
+            if f.type is float and not math.isfinite(value) or low is not None and value < low or high is not None and value > high:
+                bounds = f"from {low} to {high}" if high is not None else f"of at least {low}" if low is not None else "that is finite"
+                raise InputError(f"{name} is {value}: give a number {bounds}")
+            if f.metadata["choices"] and value not in f.metadata["choices"]:
+                raise InputError(f"{name} is {value!r}: choose {' or '.join(f.metadata['choices'])}")
+        if self.n > self.N:
+            raise InputError(f"n is {self.n} and N is {self.N}: a distance cannot be both similar and dissimilar; give n <= N")
+        for name in ("trajectory_steps", "additional_steps"):
+            if getattr(self, name) <= self.N:
+                raise InputError(f"{name} is {getattr(self, name)}: a negative pair is more than N = {self.N} steps apart, "
+                                 f"so there would be none; give at least {self.N + 1}")
+        if self.pretrain_steps >= self.steps:
+            raise InputError(f"pretrain_steps is {self.pretrain_steps} of {self.steps} steps: nothing is left to explore; "
+                             "give more steps, or less pretraining")
+
+
+# The maze's: what a small image, a small budget and a CPU need; the rest is the paper's.
+MAZE = Config(steps=100_000, pretrain_steps=8_000, M=20, trajectory_steps=150, L=20, additional_steps=100, frame_size=32,
+              encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_batch=128,
+              rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3)
+CONFIGS = {"paper": Config(), "maze": MAZE}
+
+# ------------------------------------------------------------------------------------ the algorithm (4; S4-01 ... S4-07)
+
+PURPOSES = ("init", "sample", "explore", "buffer", "additional", "pairs", "prefix", "rates", "similarity", "novelty")
+_owners = itertools.count()
+
+
+class RbExplore:
+    """The algorithm of section 4.
+
+    env_fn: makes the persistent environment (envs.PersistentEnv says what that is); where the executor has processes, it
+    must pickle. executor: any concurrent.futures.Executor, to run trajectories in; the result is the same for each.
+    tell: hears of progress (step, done, total), of every decision, and of each complete iteration (row).
+    Raises InputError for an environment that breaks the contract, FloatingPointError for a loss that is not finite."""
+
+    def __init__(self, env_fn: Callable, config: Config | None = None, device: str = "cpu", executor=None,
+                 tell: Callable = lambda event, **data: None):
+        self.config, self.env_fn, self.executor, self.tell = config or Config(), env_fn, executor, tell
+        self.env, self.owner = env_fn(), f"{os.getpid()}.{next(_owners)}"
+        check_contract(self.env)
+        self.s_init = self.env.reset(seed=self.config.seed)[0].copy()
+        self.snap_init, self.unit_init = self.env.snapshot(), self.env.unit()
+        self.similarity = SimilarityModel(self.config, self.s_init.shape, device)
+        self.novelty = RND(self.config, self.s_init.shape, device)
+        self.graph = Graph(self.s_init, self.snap_init, self.config)
+        self.phase, self.iteration, self.steps, self.exploration_steps = "pretrain", 0, 0, 0
+        self.discovered: dict[tuple, int] = {}  # coverage unit -> the step at which it was first visited
+        self.novel: list[bytes] = []  # B: snapshots of novel states
+        self.replay: deque[Pairs] = deque(maxlen=self.config.replay_iterations)
+
+    def run(self) -> "RbExplore":
+        """Iterate until the budget of steps is spent."""
+        while self.steps < self.config.steps:
+            self.iterate()
+        return self
+
+    def iterate(self) -> dict:
+        """One iteration: the paper's five steps in the paper's order. Returns its metrics."""
+        if self.phase == "pretrain" and self.steps >= self.config.pretrain_steps:
+            self.restart()
+        self.iteration += 1
+        self.row = {"iteration": self.iteration, "phase": self.phase, "theta_sim": self.theta_sim()}
+        self.tell("iteration", **self.row)
+
+        trajectories = self.explore()
+        pairs = self.make_pairs(trajectories)
+        self.train_similarity(pairs)
+        self.update_graph(trajectories)
+        self.train_novelty(trajectories)
+
+        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
+        self.row |= {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
+                     "coverage": units / full if full else None, "clusters": len(self.graph.clusters)}
+        self.tell("row", row=self.row)
+        return self.row
+
+    def restart(self) -> None:
+        """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
+        self.phase, self.novel, self.graph = "explore", [], Graph(self.s_init, self.snap_init, self.config)
+        if self.unit_init is not None:
+            self.discovered[tuple(self.unit_init)] = self.steps
+        self.tell("restart")
+
+    def theta_sim(self) -> float:
+        """The threshold; in pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
+        share = self.steps / self.config.pretrain_steps if self.phase == "pretrain" else 1
+        return self.config.theta_sim * share
+
+    def seed(self, purpose: str, index: int = -1) -> list[int]:
+        """A seed for each purpose of each iteration, so that nothing random is carried from one to the next."""
+        return [self.config.seed, self.iteration, PURPOSES.index(purpose), index + 1]
+
+    def rng(self, purpose: str) -> np.random.Generator:
+        return np.random.default_rng(self.seed(purpose))
+
+    def explore(self) -> list["Trajectory"]:
+        """Step 1: sample M clusters, with replacement (R12), roll back to each, walk (S4-01, S4.2-12, S6.1-06, S6.1-11)."""
+        ids, probabilities = self.graph.sampling_distribution()
+        chosen = self.rng("sample").choice(ids, size=self.config.M, p=probabilities).tolist()
+        self.tell("sample", clusters=ids, probabilities=probabilities.tolist(), chosen=chosen)
+        snapshots = [self.graph.clusters[v].snapshot for v in chosen]
+        trajectories = self.collect("explore", snapshots, self.config.trajectory_steps)
+        for tau, v in zip(trajectories, chosen, strict=False):  # fewer, where the budget of steps ended
+            tau.start = v
+        return trajectories
+
+    def collect(self, purpose: str, snapshots: list[bytes], steps: int) -> list["Trajectory"]:
+        """Walk at most `steps` steps from each snapshot. Every step costs one, whatever it serves (R2), and none is taken
+        beyond the budget (S6.2-04). Only exploration covers units (R25)."""
+        end = self.config.pretrain_steps if self.phase == "pretrain" else self.config.steps
+        trajectories: list[Trajectory] = []
+        while len(trajectories) < len(snapshots) and self.steps < end:
+            todo = list(range(len(trajectories), len(snapshots)))
+            if len(todo) * steps > end - self.steps:  # they might not all fit: one at a time
+                todo = todo[:1]
+            jobs = [(snapshots[k], self.seed(purpose, k), min(steps, end - self.steps), purpose == "explore") for k in todo]
+            if self.executor:
+                done = self.executor.map(walk_remotely, [(self.owner, self.env_fn)] * len(jobs), jobs)
+            else:
+                done = (walk(self.env, *job) for job in jobs)
+            for tau in done:
+                for unit in tau.units:
+                    self.steps += 1
+                    self.exploration_steps += purpose == "explore"
+                    if purpose == "explore" and self.phase == "explore" and unit is not None:
+                        self.discovered.setdefault(tuple(unit), self.steps)
+                trajectories.append(tau)
+                self.tell("progress", step=purpose, done=len(trajectories), total=len(snapshots))
+        return trajectories
+
+    def make_pairs(self, trajectories: list["Trajectory"]) -> "Pairs":
+        """Step 2: label pairs of exploration and of additional trajectories, and prefixes for the former (S4-02, S4.1-09)."""
+        additional = self.additional_trajectories(trajectories)
+        pairs, rng, prefix_rng = Pairs(), self.rng("pairs"), self.rng("prefix")  # so --no-prefix leaves the rest alone
+        for source, taus in (("exploration", trajectories), ("additional", additional)):
+            for tau in taus:
+                pairs.add_trajectory(source, tau.frames, self.config, rng)
+                if self.config.prefix and tau.start:  # cluster 0 is the initial one: its prefix is empty (S4.2-21)
+                    pairs.add_prefix(tau.frames, self.graph.clusters[tau.start].path.states(), self.config, prefix_rng)
+        self.tell("pairs", **pairs.counts)
+        return pairs
+
+    def additional_trajectories(self, trajectories: list["Trajectory"]) -> list["Trajectory"]:
+        """Put novel states into B, sample L of it, walk on from them (S4.2-15 ... S4.2-18). They serve R alone."""
+        if not self.config.keep_buffer:
+            self.novel = []
+        states = novel = 0
+        for k, tau in enumerate(trajectories):
+            reward = self.novelty.reward(tau.frames)  # (T,)
+            found = np.flatnonzero(reward > self.config.beta)
+            self.novel += [tau.snapshots[i] for i in found]
+            self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
+            states, novel = states + len(reward), novel + len(found)
+        sample = self.rng("buffer").permutation(len(self.novel))[: self.config.L]
+        additional = self.collect("additional", [self.novel[i] for i in sample], self.config.additional_steps)
+        self.row |= {"novel_share": novel / states, "additional": len(additional)}
+        return additional
+
+    def train_similarity(self, pairs: "Pairs") -> None:
+        """Step 3: train R on this iteration's pairs (S4-03, S4-06); first measure it on them, while they are unseen."""
+        self.row |= self.similarity.rates(pairs, self.rng("rates"))
+        training = Pairs.joined([*self.replay, pairs]) if self.replay else pairs
+        self.row["r_loss"] = self.similarity.fit(training, self.config, self.rng("similarity"), self.tell)
+        self.replay.append(pairs)  # which keeps none by default (R19)
+
+    def update_graph(self, trajectories: list["Trajectory"]) -> None:
+        """Step 4: add the exploration trajectories to G; every 15th iteration then merge (S4-04, S6.1-10, S6.3-01)."""
+        before = len(self.graph.clusters)
+        self.graph.embed_centres(self.similarity)  # R has changed since: old embeddings are stale
+        for k, tau in enumerate(trajectories):
+            decisions = self.graph.add_trajectory(tau, self.similarity, self.row["theta_sim"])
+            self.tell("assign", trajectory=k, start=tau.start, **decisions)
+            self.tell("progress", step="update", done=k + 1, total=len(trajectories))
+        self.row |= {"added": len(self.graph.clusters) - before, "merged": 0}
+        if self.config.merge and self.iteration % self.config.merge_every == 0:
+            merged = self.graph.merge(self.similarity, self.config.theta_merge)
+            self.tell("merge", merged=merged)
+            self.row["merged"] = len(merged)
+
+    def train_novelty(self, trajectories: list["Trajectory"]) -> None:
+        """Step 5: train RND, last, on the states of the exploration trajectories and no others (S4-05)."""
+        self.row["rnd_loss"] = self.novelty.fit([tau.frames for tau in trajectories], self.rng("novelty"), self.tell)
+
+
+# ----------------------------------------------------- step 1: trajectories of a persistent MDP (3.2, 4.2; S3.2-01, 02)
+
+
+@dataclass
+class Trajectory:
+    """tau = (s_1, snap_1) ... (s_T, snap_T); the terminal state of a death is not one of them (R10)."""
+
+    frames: np.ndarray  # (T, H, W) uint8
+    snapshots: list[bytes]  # T; none for an additional trajectory
+    actions: list[bytes]  # T; actions[t] lead from state t-1 to state t: one, or more across blank frames (R24)
+    units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
+    start: int | None = None  # the cluster it started from; none for an additional trajectory
+
+
+def walk(env, snapshot: bytes, seed: list[int], steps: int, keep_snapshots: bool) -> Trajectory:
+    """Roll back to `snapshot`, which costs no step, and follow pi_explore, uniform over the actions (6.1; S4.2-02), for
+    `steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments alone."""
+    frames, snapshots, actions, units, since = [env.restore(snapshot).copy()], [snapshot], [b""], [], b""
+    for action in np.random.default_rng(seed).integers(env.action_space.n, size=steps).tolist():
+        frame, _, terminated, truncated, info = env.step(action + int(env.action_space.start))
+        units.append(env.unit())
+        since += bytes([action])
+        if terminated:
+            break
+        if not info.get("blank"):  # a black transition frame is stepped and counted, but it is no state (R24)
+            frames.append(frame.copy())
+            actions.append(since)
+            since = b""
+            if keep_snapshots:
+                snapshots.append(env.snapshot())
+        if truncated:
+            break
+    return Trajectory(np.stack(frames), snapshots if keep_snapshots else [], actions, units)
+
+
+_worker = threading.local()  # an environment for each process, or thread, of an executor
+
+
+def walk_remotely(owner: tuple[str, Callable], job: tuple) -> Trajectory:
+    """`walk` in a worker, which makes an environment at its first job for this owner, and keeps it."""
+    if getattr(_worker, "owner", None) != owner[0]:
+        if getattr(_worker, "env", None):
+            _worker.env.close()
+        _worker.owner, _worker.env = owner[0], owner[1]()
+        _worker.env.reset()
+    return walk(_worker.env, *job)
+
+
+# -------------------------------------------------------------------- step 2: training pairs (4.1; S4.1-02 ... S4.1-09)
+
+
+@dataclass
+class Pairs:
+    """The training data D: pairs (s_1, s_2, y)."""
+
+    states: list[np.ndarray] = field(default_factory=list)  # frames, (H, W) uint8
+    index: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))  # (D, 2) s_1 and s_2 among `states`
+    y: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # (D,) 1 similar, 0 dissimilar
+    counts: Counter = field(default_factory=Counter)  # pairs of each kind
+
+    def add_trajectory(self, source: str, frames: np.ndarray, config: Config, rng: np.random.Generator) -> None:
+        """(a), (b) of figure 2: each state with a state less than n away, and one more than N away if there is one; both
+        are drawn uniformly from those of the same trajectory (R17). frames: (T, H, W)."""
+        T, i, base = len(frames), np.arange(len(frames)), len(self.states)
+        near = rng.integers(np.maximum(i - (config.n - 1), 0), np.minimum(i + config.n, T))
+        before = np.maximum(i - config.N, 0)  # so many states lie more than N before i: 0 ... i-N-1
+        after = np.maximum(T - 1 - config.N - i, 0)  # and after it: i+N+1 ... T-1
+        i_far = np.flatnonzero(before + after)
+        k = rng.integers((before + after)[i_far])
+        far = np.where(k < before[i_far], k, k - before[i_far] + i_far + config.N + 1)
+        self.states += list(frames)
+        self._add(f"{source} positive", base + i, base + near, 1, rng)
+        self._add(f"{source} negative", base + i_far, base + far, 0, rng)
+
+    def add_prefix(self, frames: np.ndarray, prefix: list[np.ndarray], config: Config, rng: np.random.Generator) -> None:
+        """(c) of figure 2: each state i of the trajectory added last with a state j of its full prefix, drawn from all that
+        are more than N away along the joined path (S4.2-22, S4.2-23, R16)."""
+        i, base = np.arange(len(frames)), len(self.states)
+        # The prefix ends with the state that the trajectory begins with, so (P - 1 - j) + i steps lie in between.
+        eligible = np.clip(len(prefix) - 1 - config.N + i, 0, len(prefix))
+        i = np.flatnonzero(eligible)
+        self.states += prefix
+        self._add("exploration prefix", base - len(frames) + i, base + rng.integers(eligible[i]), 0, rng)
+
+    def _add(self, kind: str, s_1: np.ndarray, s_2: np.ndarray, y: int, rng: np.random.Generator) -> None:
+        index = np.stack([s_1, s_2], axis=1)  # (k, 2)
+        swap = rng.random(len(index)) < 0.5  # a prefix state always comes first: the order must not give it away (R17)
+        index[swap] = index[swap, ::-1]
+        self.index, self.y = np.concatenate([self.index, index]), np.append(self.y, np.full(len(index), y))
+        self.counts[kind] += len(index)
+
+    @staticmethod
+    def joined(parts: list["Pairs"]) -> "Pairs":
+        starts = np.cumsum([0] + [len(part.states) for part in parts])
+        return Pairs([s for part in parts for s in part.states],
+                     np.concatenate([part.index + start for part, start in zip(parts, starts, strict=False)]),
+                     np.concatenate([part.y for part in parts]), sum((part.counts for part in parts), Counter()))
+
+    def balanced(self, rng: np.random.Generator, most: int | None = None) -> np.ndarray:
+        """As many positive as negative pairs, at most `most` of each, in random order: indices of pairs (R17)."""
+        classes = [rng.permutation(np.flatnonzero(self.y == y)) for y in (0, 1)]
+        size = min(*map(len, classes), most or len(self.y))
+        return rng.permutation(np.concatenate([c[:size] for c in classes]))
+
+    def frames(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The states s_1 and the states s_2 of the chosen pairs, (B, H, W) each."""
+        return tuple(np.stack([self.states[s] for s in self.index[chosen, side]]) for side in (0, 1))
+
+
+# --------------------------------------------------- step 3: the similarity model R (4.1, 6.1; S4.1-08, S6.1-02 ... 04)
+
+
+def to_input(frames: np.ndarray, device: str) -> torch.Tensor:
+    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1."""
+    x = torch.from_numpy(frames).to(device)
+    return (x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)).float() / 255
+
+
+class BasicBlock(nn.Module):
+    """The residual block of ResNet-18 (He et al. 2016)."""
+
+    def __init__(self, inputs: int, width: int, stride: int):
+        super().__init__()
+        self.residual = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(),
+            nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
+        self.shortcut = nn.Sequential()
+        if stride > 1:
+            self.shortcut = nn.Sequential(nn.Conv2d(inputs, width, 1, stride, bias=False), nn.BatchNorm2d(width))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return F.relu(self.residual(x) + self.shortcut(x))
+
+
+def resnet18(channels: int, out: int) -> nn.Module:
+    """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
+    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
+    for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
+        layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
+    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(512, out))
+
+
+SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding
+NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))  # Mnih et al. 2015, which Burda et al. 2019 use
+
+
+def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module:
+    """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
+    modules, (height, width), channels = [], shape[:2], channels_of(shape)
+    for planes, kernel, stride, pad in layers:
+        modules += [nn.Conv2d(channels, planes, kernel, stride, pad), *([nn.BatchNorm2d(planes)] if norm else []), nn.ReLU()]
+        height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
+        channels = planes
+    if min(height, width) < 1:
+        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: set rnd_encoder to small")
+    return nn.Sequential(*modules, nn.Flatten(), nn.Linear(channels * height * width, out))
+
+
+def channels_of(shape: tuple) -> int:
+    return shape[2] if len(shape) == 3 else 1
+
+
+def initialise(module: nn.Module, seed: int) -> nn.Module:
+    """He's initialisation, and biases of 0, from a generator of our own."""
+    generator = torch.Generator().manual_seed(seed)
+    for layer in module.modules():
+        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+    return module
+
+
+def finite(loss: torch.Tensor, what: str) -> float:
+    if not math.isfinite(loss.item()):
+        raise FloatingPointError(f"the loss of {what} is {loss.item()}: start again with a lower learning rate")
+    return loss.item()
+
+
+class SimilarityModel(nn.Module):
+    """R_w(s_1, s_2): a shared encoder embeds both frames, four fully connected layers classify the two embeddings (6.1).
+    In evaluation mode, save within `fit`: R of a pair then depends on nothing else (S4.1-01)."""
+
+    def __init__(self, config: Config, shape: tuple, device: str = "cpu"):
+        super().__init__()
+        d, w, head = config.embedding, config.head_width, []
+        with torch.random.fork_rng(devices=[]):  # torch initialises too, from its global generator, which stays as it is
+            small = config.encoder == "small"
+            self.encoder = convolutions(shape, d, SMALL, norm=True) if small else resnet18(channels_of(shape), d)
+            for inputs, outputs in ((2 * d, w), (w, w), (w, w), (w, 1)):
+                head += [nn.BatchNorm1d(inputs), nn.ReLU(), nn.Linear(inputs, outputs)]  # R20
+            self.head = nn.Sequential(*head)
+        initialise(self, config.seed).to(device, memory_format=torch.channels_last).eval()  # which is faster
+        self.device, self.optimiser = device, torch.optim.Adam(self.parameters(), lr=config.r_learning_rate)
+
+    def forward(self, first: np.ndarray, second: np.ndarray) -> torch.Tensor:
+        """Frames (B, H, W) and (B, H, W) -> logits (B,)."""
+        embeddings = self.encoder(to_input(np.concatenate([first, second]), self.device))  # (2B, d)
+        return self.head(torch.cat(embeddings.chunk(2), dim=1)).squeeze(1)
+
+    @torch.no_grad()
+    def embed(self, frames: np.ndarray) -> torch.Tensor:
+        """Frames (T, H, W) uint8 -> embeddings (T, d)."""
+        return torch.cat([self.encoder(to_input(part, self.device)) for part in chunks(frames)])
+
+    @torch.no_grad()
+    def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
+        """R of embeddings (K, d) and (K, d) or (d,) -> (K,) in [0, 1]."""
+        logits = self.head(torch.cat([first, second.expand_as(first)], dim=1))
+        return torch.sigmoid(logits).squeeze(1).cpu().numpy()
+
+    def fit(self, pairs: Pairs, config: Config, rng: np.random.Generator, tell: Callable) -> float | None:
+        """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs."""
+        self.train()
+        for epoch in range(config.epochs):
+            order, losses = pairs.balanced(rng), []
+            batches = np.array_split(order, math.ceil(len(order) / config.r_batch) or 1)
+            for k, batch in enumerate(batches if len(order) else []):
+                losses.append(self.update(*pairs.frames(batch), pairs.y[batch], config.r_clip))
+                tell("progress", step="train R", done=epoch * len(batches) + k + 1, total=config.epochs * len(batches))
+        self.eval()
+        return float(np.mean(losses)) if losses else None
+
+    def update(self, first: np.ndarray, second: np.ndarray, y: np.ndarray, clip: float) -> float:
+        """One step on a batch: frames (B, H, W) twice, labels (B,). Returns the loss: -y log R - (1 - y) log(1 - R)."""
+        loss = F.binary_cross_entropy_with_logits(self(first, second), torch.from_numpy(y).float().to(self.device))
+        self.optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.parameters(), clip)
+        self.optimiser.step()
+        return finite(loss, "R")
+
+    def rates(self, pairs: Pairs, rng: np.random.Generator, most: int = 500) -> dict[str, float]:
+        """How often R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
+        chosen = pairs.balanced(rng, most)
+        if not len(chosen):
+            return {}
+        first, second = map(self.embed, pairs.frames(chosen))
+        right, similar = (self.score(first, second) > 0.5) == pairs.y[chosen], pairs.y[chosen] == 1
+        return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
+                "r_true_negative": float(right[~similar].mean())}
+
+
+def chunks(frames: np.ndarray, size: int = 512) -> list[np.ndarray]:
+    return [frames[k : k + size] for k in range(0, len(frames), size)]
+
+
+# ----------------------------------------- step 4: the graph of clusters, prefixes, merge (4.2; S4.2-01 ... S4.2-29)
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A prefix: the states from a parent's centre (exclusive) to a cluster's centre, just as they were walked.
+
+    Linked to the parent's own it is the full prefix s_init ... s. It never changes, merge or not, so distances along it
+    stay true, and its actions lead from s_init to s: they are the policy pi^p of section 3.2 (R15; S3.2-03)."""
+
+    parent: "Path | None"
+    frames: np.ndarray  # (k, H, W) uint8; the last one is the centre
+    actions: tuple[bytes, ...]  # k; actions[t] lead to frames[t]
+
+    def chain(self) -> list["Path"]:
+        """The links from s_init to this one."""
+        links = [self]
+        while links[-1].parent:
+            links.append(links[-1].parent)
+        return links[::-1]
+
+    def states(self) -> list[np.ndarray]:
+        """The full prefix s_init ... s, in the order of time."""
+        return [frame for link in self.chain() for frame in link.frames]
+
+    def replay(self) -> bytes:
+        """The actions that lead from s_init to s."""
+        return b"".join(action for link in self.chain() for action in link.actions)
+
+
+@dataclass(eq=False)
+class Cluster:
+    """v = (s, snap), and what G knows of it."""
+
+    frame: np.ndarray  # s, the centre, (H, W) uint8
+    snapshot: bytes
+    path: Path
+    parent: int | None  # its arc in E_parent; none for the initial cluster
+    visits: int = 0  # states assigned to it, its own centre included (R11)
+
+
+class Graph:
+    """G. Clusters are numbered in the order of their creation; number 0 is (s_init, snap_init) (S4.2-11)."""
+
+    def __init__(self, s_init: np.ndarray, snap_init: bytes, config: Config):
+        self.trim, self.max_clusters = config.trim, config.max_clusters
+        self.clusters = {0: Cluster(s_init, snap_init, Path(None, s_init[None], (b"",)), None, visits=1)}
+        self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
+        self.adjacent: dict[int, set[int]] = {0: set()}  # clusters at the other end of an arc, either way (R8)
+        self.created = self.assigned = 1  # clusters ever made; states ever assigned
+        self.refused = 0  # clusters that max_clusters prevented
+
+    def sampling_distribution(self) -> tuple[list[int], np.ndarray]:
+        """sigma: the clusters, each with a probability inverse to its visits (6.1)."""
+        weights = 1 / np.array([v.visits for v in self.clusters.values()])
+        return list(self.clusters), weights / weights.sum()
+
+    def embed_centres(self, similarity: SimilarityModel) -> None:
+        self.centres = similarity.embed(np.stack([v.frame for v in self.clusters.values()]))  # (V, d)
+        self.row = {v: row for row, v in enumerate(self.clusters)}
+
+    def add_trajectory(self, tau: Trajectory, similarity: SimilarityModel, theta: float) -> dict[str, list]:
+        """Assign every state in order: it joins a cluster, or makes one (S4.2-06). Returns the cluster of each state, the R
+        that decided it, and each new cluster with its parent."""
+        previous = parent = tau.start  # the first state is this cluster's centre (R9)
+        self.visit(previous)
+        clusters, scores, made, parent_at = [previous], [None], [], 0
+        embeddings = similarity.embed(tau.frames)  # (T, d)
+        for i in range(1, len(tau.frames) - self.trim):
+            cluster, score = self.find(embeddings[i], previous, similarity, theta)
+            if cluster is None:
+                cluster = self.create(tau, i, parent, parent_at, embeddings[i])
+                made.append((cluster, parent))
+                parent, parent_at = cluster, i  # the parent is the cluster made last, else the start (R13)
+            self.visit(cluster)
+            if cluster != previous:
+                self.add_arc(previous, cluster, 1)
+            previous = cluster
+            clusters.append(cluster)
+            scores.append(score)
+        return {"clusters": clusters, "R": scores, "made": made}
+
+    def find(self, s_i: torch.Tensor, previous: int, similarity: SimilarityModel, theta: float) -> tuple[int | None, float]:
+        """The cluster with R(centre, s_i) > theta and that R: the best adjacent to the previous one, or else the best of
+        all, or else none (S4.2-03, 04, 05, 13; R7). s_i: (d,)."""
+        for ids in (sorted(self.adjacent[previous] | {previous}), list(self.clusters)):
+            scores = similarity.score(self.centres[[self.row[v] for v in ids]], s_i)
+            best = int(scores.argmax())
+            if scores[best] > theta:
+                return ids[best], float(scores[best])
+        if self.max_clusters and len(ids) >= self.max_clusters:
+            self.refused += 1
+            return ids[best], float(scores[best])
+        return None, float(scores[best])
+
+    def create(self, tau: Trajectory, i: int, parent: int, parent_at: int, s_i: torch.Tensor) -> int:
+        """A cluster with state i of tau as its centre, and its prefix from its parent's centre (S4.2-01, 19, 20)."""
+        since = slice(parent_at + 1, i + 1)
+        path = Path(self.clusters[parent].path, tau.frames[since].copy(), tuple(tau.actions[since]))
+        new, self.created = self.created, self.created + 1
+        self.clusters[new] = Cluster(path.frames[-1], tau.snapshots[i], path, parent)
+        self.adjacent[new], self.row[new] = set(), len(self.centres)
+        self.centres = torch.cat([self.centres, s_i[None]])
+        return new
+
+    def visit(self, v: int) -> None:
+        self.clusters[v].visits += 1
+        self.assigned += 1
+
+    def add_arc(self, a: int, b: int, visits: int) -> None:
+        self.arcs[a, b] = self.arcs.get((a, b), 0) + visits
+        self.adjacent[a].add(b)
+        self.adjacent[b].add(a)
+
+    def merge(self, similarity: SimilarityModel, theta: float) -> list[tuple[int, int, float]]:
+        """Test all pairs: in the order of creation, each cluster joins the most similar earlier survivor with
+        R(earlier, later) > theta (S4.2-24, 25; R14). Returns (survivor, merged, R) for each."""
+        merged, kept = [], [0]
+        for later in list(self.clusters)[1:]:
+            scores = similarity.score(self.centres[[self.row[v] for v in kept]], self.centres[self.row[later]])
+            best = int(scores.argmax())
+            if scores[best] > theta:
+                self.absorb(kept[best], later)
+                merged.append((kept[best], later, float(scores[best])))
+            else:
+                kept.append(later)
+        self.centres = self.centres[[self.row[v] for v in kept]]
+        self.row = {v: row for row, v in enumerate(kept)}
+        return merged
+
+    def absorb(self, earlier: int, later: int) -> None:
+        """The earlier cluster keeps its centre and inherits visits, arcs and children (S4.2-26 ... S4.2-29; R15)."""
+        self.clusters[earlier].visits += self.clusters.pop(later).visits
+        for a, b in [arc for arc in self.arcs if later in arc]:
+            visits, ends = self.arcs.pop((a, b)), (earlier if a == later else a, earlier if b == later else b)
+            if ends[0] != ends[1]:
+                self.add_arc(*ends, visits)
+        for other in self.adjacent.pop(later):
+            self.adjacent[other].discard(later)
+        for v in self.clusters.values():
+            if v.parent == later:  # a parent stays older than its child, so no cycle can arise
+                v.parent = earlier
+
+    def check(self) -> None:
+        """Assert the invariants of G."""
+        ids, ends = list(self.clusters), {v: set() for v in self.clusters}
+        assert ids[0] == 0 and ids == sorted(ids), "the initial cluster stays, and comes first"
+        assert sum(v.visits for v in self.clusters.values()) == self.assigned, "visits are conserved"
+        for (a, b), visits in self.arcs.items():
+            assert a != b and visits > 0, "an arc was walked between two clusters"
+            ends[a].add(b)
+            ends[b].add(a)
+        assert ends == self.adjacent, "adjacent clusters are the ends of arcs"
+        for v, cluster in self.clusters.items():
+            assert (cluster.parent is None) == (v == 0), "every cluster but the first has a parent"
+            assert v == 0 or cluster.parent in self.clusters and cluster.parent < v, "which exists and is older"
+            assert cluster.path.chain()[0] is self.clusters[0].path, "every full prefix begins with s_init"
+            assert np.array_equal(cluster.path.frames[-1], cluster.frame), "and ends with the centre"
+
+
+# -------------------------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
+
+
+class Moments:
+    """Count, mean and variance of all batches so far, joined exactly (Chan et al. 1979), in float64."""
+
+    def __init__(self, batch: np.ndarray | None = None):
+        self.count, self.mean, self.m2 = 0, np.zeros(()), np.zeros(())
+        if batch is not None:  # (B, ...): moments of each entry
+            self.count, self.mean = len(batch), batch.mean(0, dtype=np.float64)
+            self.m2 = np.square(batch - self.mean).sum(0)
+
+    def join(self, other: "Moments") -> "Moments":
+        total, delta = self.count + other.count, other.mean - self.mean
+        self.m2 = self.m2 + other.m2 + delta**2 * (self.count * other.count / total)
+        self.mean, self.count = self.mean + delta * (other.count / total), total
+        return self
+
+    def standardise(self, x: np.ndarray) -> np.ndarray:
+        return (x - self.mean) / np.maximum(np.sqrt(self.m2 / max(self.count, 1)), 1e-8)
+
+
+class RND:
+    """Random network distillation (Burda et al. 2019): a predictor learns the output of a fixed random target network; its
+    error is large on states unlike those it was trained on."""
+
+    def __init__(self, config: Config, shape: tuple, device: str = "cpu"):
+        layers, out = SMALL if config.rnd_encoder == "small" else NATURE, config.rnd_features
+        with torch.random.fork_rng(devices=[]):
+            self.target = convolutions(shape, out, layers, norm=False)
+            self.predictor = nn.Sequential(copy.deepcopy(self.target), nn.ReLU(), nn.Linear(out, out), nn.ReLU(),
+                                           nn.Linear(out, out))
+        initialise(self.target, config.seed + 1).to(device)
+        initialise(self.predictor, config.seed + 2).to(device)
+        self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.rnd_learning_rate)
+        self.device, self.batch = device, config.rnd_batch
+        self.pixels = Moments()  # of each pixel, over all states trained on
+        self.errors: deque[Moments] = deque(maxlen=config.novelty_window)  # of the error, one an iteration
+
+    def distance(self, frames: np.ndarray) -> torch.Tensor:
+        """Frames (B, H, W) -> the predictor's mean squared error (B,), on pixels standardised and clipped to +-5 (R4)."""
+        x = torch.from_numpy(self.pixels.standardise(frames).clip(-5, 5).astype(np.float32)).to(self.device)
+        x = x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
+        with torch.no_grad():
+            goal = self.target(x)
+        return (self.predictor(x) - goal).square().mean(1)
+
+    @torch.no_grad()
+    def reward(self, frames: np.ndarray) -> np.ndarray:
+        """The intrinsic reward: frames (T, H, W) -> (T,), errors in standard deviations from the mean of the latest
+        iterations' (R4). Changes nothing. Before the first training nothing is novel (R6)."""
+        recent = Moments()
+        for moments in self.errors:
+            recent.join(moments)
+        if not recent.count:
+            return np.full(len(frames), -np.inf)
+        return recent.standardise(np.concatenate([self.distance(part).cpu().numpy() for part in chunks(frames)]))
+
+    def fit(self, trajectories: list[np.ndarray], rng: np.random.Generator, tell: Callable) -> float:
+        """Update the normalisers and train the predictor, one pass; (T, H, W) each. Returns the mean loss."""
+        for part in (part for frames in trajectories for part in chunks(frames)):
+            self.pixels.join(Moments(part))
+        states, errors = [frame for frames in trajectories for frame in frames], []
+        batches = np.array_split(rng.permutation(len(states)), math.ceil(len(states) / self.batch))
+        for k, batch in enumerate(batches):
+            errors.append(self.update(np.stack([states[s] for s in batch])))
+            tell("progress", step="train RND", done=k + 1, total=len(batches))
+        self.errors.append(Moments(np.concatenate(errors)))
+        return float(self.errors[-1].mean)
+
+    def update(self, frames: np.ndarray) -> np.ndarray:
+        """One step of the predictor on a batch (B, H, W). Returns the errors before it (B,)."""
+        error = self.distance(frames)
+        self.optimiser.zero_grad()
+        error.mean().backward()
+        self.optimiser.step()
+        finite(error.mean(), "RND")
+        return error.detach().cpu().numpy()
+
+
+# ######################################################################################################################
+# Nothing below this line belongs to the algorithm: the run folder, its figures, the command line.
+# ######################################################################################################################
+
+METRICS = ("iteration", "phase", "steps", "exploration_steps", "coverage", "units", "clusters", "added", "merged",
+           "theta_sim", "r_loss", "r_accuracy", "r_true_positive", "r_true_negative", "novel_share", "additional",
+           "rnd_loss", "memory_mb", "seconds")
+
+# --------------------------------------------------------------------------------------- the state of a run, as plain data
+
+
+def stateful(a: RbExplore) -> tuple:
+    return a.similarity, a.similarity.optimiser, a.novelty.target, a.novelty.predictor, a.novelty.optimiser
+
+
+def pack(a: RbExplore) -> dict:
+    """All that a run needs to go on, as tensors, numbers, strings and bytes, which load without unpickling objects. There
+    is no generator in it: each is made from the seed, the iteration and a purpose."""
+    number: dict[Path, int] = {}  # each path once, parents first
+    for v in a.graph.clusters.values():
+        for link in v.path.chain():
+            number.setdefault(link, len(number))
+    tensor = torch.as_tensor
+    return {
+        "counters": [a.phase, a.iteration, a.steps, a.exploration_steps],
+        "discovered": [(list(unit), step) for unit, step in a.discovered.items()],
+        "networks": [part.state_dict() for part in stateful(a)],
+        "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in (a.novelty.pixels, *a.novelty.errors)],
+        "buffer": list(a.novel),
+        "replay": [(tensor(np.stack(p.states)), tensor(p.index), tensor(p.y), dict(p.counts)) for p in a.replay],
+        "paths": [(number.get(p.parent, -1), tensor(p.frames), list(p.actions)) for p in number],
+        "clusters": [(id, v.snapshot, number[v.path], v.parent, v.visits) for id, v in a.graph.clusters.items()],
+        "arcs": [(*arc, visits) for arc, visits in a.graph.arcs.items()],
+        "graph": [a.graph.created, a.graph.assigned, a.graph.refused],
+    }
+
+
+def unpack(a: RbExplore, state: dict) -> None:
+    """Put a packed state into an algorithm of the same configuration."""
+    a.phase, a.iteration, a.steps, a.exploration_steps = state["counters"]
+    a.discovered = {tuple(unit): step for unit, step in state["discovered"]}
+    for part, saved in zip(stateful(a), state["networks"], strict=True):
+        part.load_state_dict(saved)
+    moments = []
+    for count, mean, m2 in state["moments"]:
+        moments.append(Moments())
+        moments[-1].count, moments[-1].mean, moments[-1].m2 = count, mean.numpy(), m2.numpy()
+    a.novelty.pixels = moments[0]
+    a.novelty.errors = deque(moments[1:], a.config.novelty_window)
+    a.novel = state["buffer"]
+    replay = [Pairs(list(s.numpy()), index.numpy(), y.numpy(), Counter(c)) for s, index, y, c in state["replay"]]
+    a.replay = deque(replay, a.config.replay_iterations)
+    paths: list[Path] = []
+    for parent, frames, actions in state["paths"]:
+        paths.append(Path(paths[parent] if parent >= 0 else None, frames.numpy(), tuple(actions)))
+    g = a.graph
+    g.clusters = {id: Cluster(paths[p].frames[-1], snapshot, paths[p], parent, visits)
+                  for id, snapshot, p, parent, visits in state["clusters"]}
+    g.arcs, g.adjacent = {}, {v: set() for v in g.clusters}
+    for start, end, visits in state["arcs"]:
+        g.add_arc(start, end, visits)
+    g.created, g.assigned, g.refused = state["graph"]
+
+
+def memory(a: RbExplore) -> float:
+    """Megabytes of frames and snapshots that G and B hold."""
+    links = {link for v in a.graph.clusters.values() for link in v.path.chain()}
+    held = [*(v.snapshot for v in a.graph.clusters.values()), *a.novel]
+    return round((sum(link.frames.nbytes for link in links) + sum(map(len, held))) / 2**20, 3)
+
+
+# ---------------------------------------------------------------------------------------------------- the run folder
+
+
+def write_atomically(path: pathlib.Path, write: Callable) -> None:
+    """A reader finds the old file or the new one and never half of one, also after a kill."""
+    temporary = path.with_name(path.name + ".new")
+    with open(temporary, "wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+class Run:
+    """A folder with config.json, metrics.csv, checkpoint.pt, trace.jsonl and the figures; and what one sees meanwhile."""
+
+    def __init__(self, folder: pathlib.Path, settings: dict, algorithm: RbExplore, trace: bool = False):
+        self.folder, self.settings, self.algorithm, self.tracing = folder, settings, algorithm, trace
+        self.rows, self.events, self.trace_bytes, self.live = [], [], 0, sys.stdout.isatty()
+        self.began = self.shown = time.monotonic()
+        algorithm.tell = self.tell
+
+    def create(self) -> None:
+        """Begin in a folder that holds no run yet."""
+        if (self.folder / "config.json").exists():
+            raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
+        except OSError as error:
+            raise InputError(f"{self.folder} cannot be written: {error.strerror}; choose another folder with --out") from None
+        self.save()
+
+    def load(self) -> None:
+        """Go back to the last complete iteration; what came after it is forgotten."""
+        path = self.folder / "checkpoint.pt"
+        try:
+            state = torch.load(path, map_location=self.settings["device"], weights_only=True)
+            self.rows, settings, self.trace_bytes = state["rows"], state["settings"], state["trace_bytes"]
+            unpack(self.algorithm, state["algorithm"]) if settings == self.settings else None
+        except Exception as error:  # torch raises many kinds for a file that is cut short
+            raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
+                             "another --out") from None
+        if settings != self.settings:
+            raise InputError(f"{path} is of another configuration than config.json beside it: put the right one back, or "
+                             "begin anew with another --out")
+        self.write_metrics()
+        if self.tracing:
+            os.truncate(self.folder / "trace.jsonl", self.trace_bytes)
+
+    def save(self) -> None:
+        if self.tracing:
+            with open(self.folder / "trace.jsonl", "ab") as file:
+                file.writelines(json.dumps(event).encode() + b"\n" for event in self.events)
+                self.trace_bytes, self.events = file.tell(), []
+        self.write_metrics()
+        state = {"settings": self.settings, "rows": self.rows, "trace_bytes": self.trace_bytes,
+                 "algorithm": pack(self.algorithm)}
+        write_atomically(self.folder / "checkpoint.pt", lambda f: torch.save(state, f))
+
+    def write_metrics(self) -> None:
+        lines = [",".join("" if row.get(name) is None else str(row[name]) for name in METRICS) for row in self.rows]
+        text = "\n".join([",".join(METRICS), *lines, ""])
+        write_atomically(self.folder / "metrics.csv", lambda f: f.write(text.encode()))
+
+    def tell(self, event: str, **data) -> None:
+        """Hear of the algorithm: show progress, keep the trace, and save at the end of an iteration."""
+        if event == "progress":
+            now = time.monotonic()
+            if now - self.shown > (0.2 if self.live else 30):
+                self.shown = now
+                line = f"   {data['step']}: {data['done']} of {data['total']}"
+                print(f"\r{line:<50}" if self.live else line, end="" if self.live else "\n", flush=True)
+        elif event == "row":
+            row, now = data["row"], time.monotonic()
+            row |= {"seconds": round(now - self.began, 2), "memory_mb": memory(self.algorithm)}
+            self.began = self.shown = now
+            self.rows.append(row)
+            self.save()
+            self.show(row)
+        elif self.tracing:
+            self.events.append({"event": event, **data})
+
+    COLUMNS = "  iter phase        steps  clusters   new merged   %Cov R's loss    acc    TPR    TNR  novel     s    left"
+
+    def show(self, row: dict) -> None:
+        """A line for an iteration."""
+        recent = self.rows[-5:]
+        pace = sum(r["seconds"] for r in recent) / max(1, row["steps"] - (self.rows[-6]["steps"] if len(self.rows) > 5 else 0))
+        left = round(pace * (self.settings["config"]["steps"] - row["steps"]))
+
+        def f(name, form, scale=1):
+            return format(row[name] * scale, form) if row.get(name) is not None else format("-", ">" + form.split(".")[0])
+
+        covered = f("coverage", "6.1f", 100) if row["coverage"] is not None else f"{row['units']:>5}u"
+        line = (f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row['clusters']:9} {row['added']:5} {row['merged']:6} "
+                f"{covered} {f('r_loss', '8.3f')} {f('r_accuracy', '6.3f')} {f('r_true_positive', '6.3f')} "
+                f"{f('r_true_negative', '6.3f')} {f('novel_share', '6.1f', 100)} {row['seconds']:5.1f} {left // 60:4}:{left % 60:02}")
+        print(("\r" if self.live else "") + line, flush=True)
+        if row["phase"] == "explore":
+            for name, what in (("r_true_positive", "every state new"), ("r_true_negative", "every state known")):
+                if row.get(name) is not None and row[name] < 0.2:
+                    print(f"       warning: {name} is {row[name]:.2f}: R finds {what}, so G tells little")
+        if self.algorithm.graph.refused and row["clusters"] >= self.algorithm.config.max_clusters:
+            print(f"       max_clusters has kept {self.algorithm.graph.refused} states from making a cluster so far")
+
+
+# --------------------------------------------------------------------------------------------------------- the figures
+
+
+def new_figure(width: float, height: float):
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError("figures need matplotlib: pip install matplotlib, or give --no-figures") from None
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw_figures(run: Run) -> list[str]:
+    """Draw what the run has found so far; returns the names of the files."""
+    a, folder = run.algorithm, run.folder
+    unit_of = {}  # cluster -> coverage unit, by rolling back: G itself does not know units
+    for v, cluster in a.graph.clusters.items():
+        a.env.restore(cluster.snapshot)
+        unit_of[v] = a.env.unit()
+    a.env.restore(a.snap_init)
+    drawn = a.env.level_map() if hasattr(a.env, "level_map") else None
+    level, boxes = drawn or rooms_map(set(a.discovered) | {u for u in unit_of.values() if u is not None})
+    figures = {"coverage.png": coverage_figure([(run.settings["method"], [a])]), "centres.png": centres_figure(a)}
+    if boxes:
+        figures["coverage_map.png"] = map_figure(a, level, boxes)
+        figures["graph.png"] = graph_figure(a, level, boxes, unit_of)
+    for name, figure in figures.items():
+        write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+    return list(figures)
+
+
+def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict]:
+    """A stand-in where the environment draws no level: a panel for each room, a square for each unit visited in it."""
+    if not units:
+        return np.zeros((1, 1, 3), np.uint8), {}
+    rooms = sorted({u[:-2] for u in units})
+    xs, ys = [u[-2] if len(u) > 1 else u[-1] for u in units], [u[-1] if len(u) > 1 else 0 for u in units]
+    width, height, across, side = max(xs) - min(xs) + 2, max(ys) - min(ys) + 2, math.ceil(math.sqrt(len(rooms))), 12
+    boxes = {}
+    for u in units:
+        k = rooms.index(u[:-2])
+        x, y = (u[-2] if len(u) > 1 else u[-1]) - min(xs), (u[-1] if len(u) > 1 else 0) - min(ys)
+        boxes[u] = ((k % across * width + x) * side, (k // across * height + y) * side, side, side)
+    return np.full((math.ceil(len(rooms) / across) * height * side, across * width * side, 3), 40, np.uint8), boxes
+
+
+def coverage_curve(a) -> tuple[np.ndarray, np.ndarray]:
+    """Steps, and the units covered by then."""
+    steps = np.array([0, *sorted(a.discovered.values()), a.steps])
+    return steps, np.array([0, *range(1, len(a.discovered) + 1), len(a.discovered)])
+
+
+def coverage_figure(curves: list) -> object:
+    """Coverage against agent steps: for each (name, runs) the mean, and the min-max band where there are several."""
+    figure = new_figure(7, 4)
+    axes = figure.subplots()
+    full = getattr(curves[0][1][0].env, "full_coverage", None)
+    for name, runs in curves:
+        steps, units = coverage_curve(runs[0])
+        axes.step(steps, units * (100 / full if full else 1), where="post", label=name)
+    pretrain = curves[0][1][0].config.pretrain_steps
+    if pretrain:
+        axes.axvspan(0, pretrain, color="0.9", label="pretraining")
+    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, None), ylim=(0, 102 if full else None),
+             ylabel=f"coverage, % of {full} units" if full else "units covered")
+    axes.legend(loc="lower right")
+    return figure
+
+
+def map_axes(level: np.ndarray, title: str):
+    figure = new_figure(10, 10 * level.shape[0] / level.shape[1] + 0.9)
+    axes = figure.subplots()
+    axes.imshow(level)
+    axes.set(title=title, xticks=[], yticks=[])
+    return figure, axes
+
+
+def map_figure(a, level: np.ndarray, boxes: dict) -> object:
+    """The level, its visited units coloured by the step of the first visit, the others crossed out."""
+    full = getattr(a.env, "full_coverage", None)
+    share = f"{100 * len(a.discovered) / full:.1f} % of {full} units" if full else f"{len(a.discovered)} units"
+    figure, axes = map_axes(level, f"coverage after {a.steps:,} steps: {share}")
+    heat = np.full(level.shape[:2], np.nan)
+    for unit, (x, y, w, h) in boxes.items():
+        if unit in a.discovered:
+            heat[y : y + h, x : x + w] = a.discovered[unit]
+        else:
+            axes.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
+    image = axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=a.steps)
+    figure.colorbar(image, label="step of the first visit", shrink=0.8)
+    return figure
+
+
+def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, unit_of: dict) -> object:
+    """G over the level: a disc for each cluster, its area by the visits; a line for each arc, its width by the visits."""
+    figure, axes = map_axes(level, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
+    place, crowd = {}, Counter()
+    for v, unit in unit_of.items():
+        if unit in boxes:
+            x, y, w, h = boxes[unit]
+            turn, crowd[unit] = 2.4 * crowd[unit], crowd[unit] + 1  # clusters of one unit stand around its middle
+            radius = 0 if crowd[unit] == 1 else 0.3
+            place[v] = x + w * (0.5 + radius * math.cos(turn)), y + h * (0.5 + radius * math.sin(turn))
+    most = max(v.visits for v in a.graph.clusters.values())
+    for (start, end), visits in a.graph.arcs.items():
+        if start in place and end in place:
+            axes.plot(*zip(place[start], place[end], strict=True), color="white", alpha=0.5,
+                      linewidth=0.3 + min(2.0, 0.2 * math.log1p(visits)))
+    ids = list(place)
+    points = axes.scatter(*zip(*(place[v] for v in ids), strict=True), c=ids, cmap="plasma", edgecolors="black", zorder=3,
+                          s=[12 + 300 * a.graph.clusters[v].visits / most for v in ids])
+    figure.colorbar(points, label="cluster, in the order of creation", shrink=0.8)
+    return figure
+
+
+def centres_figure(a: RbExplore, most: int = 80) -> object:
+    """A contact sheet: the centres of the clusters, at most so many, evenly from all, with number and visits."""
+    ids = list(a.graph.clusters)
+    shown = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).astype(int))]
+    across = min(10, len(shown))
+    figure = new_figure(across * 1.1 + 0.2, math.ceil(len(shown) / across) * 1.3 + 0.4)
+    figure.suptitle(f"centres of {len(shown)} of {len(ids)} clusters: number, visits", fontsize=9)
+    panels = np.ravel(figure.subplots(math.ceil(len(shown) / across), across, squeeze=False))
+    for axes in panels:
+        axes.axis("off")
+    for axes, v in zip(panels, shown, strict=False):
+        axes.imshow(a.graph.clusters[v].frame, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        axes.set_title(f"{v}: {a.graph.clusters[v].visits:,}", fontsize=7)
+    return figure
+
+
+# ---------------------------------------------------------------------------------------------------------- the profile
+
+
+class Profile:
+    """Seconds per step of the iteration: environment, network mathematics, the rest. It wraps functions from outside."""
+
+    STEPS = {"explore": "1 explore", "make_pairs": "2 pairs", "train_similarity": "3 train R", "update_graph": "4 update G",
+             "train_novelty": "5 train RND"}
+
+    def __init__(self, algorithm: RbExplore, run: Run):
+        self.seconds, self.step, self.depth = Counter(), "run folder, start", 0
+        a = algorithm
+        for name in self.STEPS:
+            self.wrap(a, name, None)
+        for name in ("step", "snapshot", "restore", "unit"):
+            self.wrap(a.env, name, "environment")
+        for owner, names in ((a.similarity, ("embed", "score", "update")), (a.novelty, ("distance", "update"))):
+            for name in names:
+                self.wrap(owner, name, "network")
+
+    def wrap(self, owner, name: str, kind: str | None) -> None:
+        inner = getattr(owner, name)
+
+        def timed(*arguments, **named):
+            before, self.depth, start = self.step, self.depth + (kind is not None), time.perf_counter()
+            self.step = self.step if kind else self.STEPS[name]
+            try:
+                return inner(*arguments, **named)
+            finally:
+                self.depth -= kind is not None
+                if kind is None or self.depth == 0:
+                    self.seconds[self.step, kind or "all"] += time.perf_counter() - start
+                self.step = before
+
+        object.__setattr__(owner, name, timed)
+
+    def table(self, total: float) -> str:
+        """Rows: the steps; columns: where the seconds went."""
+        lines = [f"{'':20}{'environment':>13}{'network':>10}{'rest':>8}{'all':>8}{'share':>8}"]
+        inside = sum(self.seconds[name, "all"] for name in self.STEPS.values())
+        sums = Counter()
+        for name in (*self.STEPS.values(), "run folder, start"):
+            env, net = self.seconds[name, "environment"], self.seconds[name, "network"]
+            whole = self.seconds[name, "all"] if name in self.STEPS.values() else total - inside
+            lines.append(f"{name:20}{env:13.2f}{net:10.2f}{whole - env - net:8.2f}{whole:8.2f}{whole / total:8.1%}")
+            sums.update(env=env, net=net)
+        rest = total - sums["env"] - sums["net"]
+        lines.append(f"{'all':20}{sums['env']:13.2f}{sums['net']:10.2f}{rest:8.2f}{total:8.2f}")
+        return "\n".join([*lines, f"outside environment steps and network mathematics: {rest / total:.1%} of the wall time"])
+
+
+# ----------------------------------------------------------------------------------------------------- the command line
+
+
+class Parser(argparse.ArgumentParser):
+    def error(self, message: str):
+        raise InputError(f"{message}; --help lists the options")
+
+
+def parser() -> Parser:
+    p = Parser(prog="rbexplore.py", allow_abbrev=False, description="Explore an environment by rolling back to stored "
+               "states, clustered by a learned similarity: RbExplore (Ugadiarov, Skrynnik, Panov).")
+    p.add_argument("--env", help="environment: maze, pop or montezuma (default: maze)")
+    p.add_argument("--level", type=int, help="level: 1 to 3 of the maze, 1 to 14 of pop (default: 1)")
+    p.add_argument("--rom", help="pop: the NES cartridge's file, which you bring")
+    p.add_argument("--state", help="pop: a start state, gzip of the emulator's; without it the cartridge boots")
+    p.add_argument("--config", choices=list(CONFIGS), help="values of all fields below (default: maze for maze, else paper)")
+    p.add_argument("--out", help="run folder (default: runs/<env>-<seed>)")
+    p.add_argument("--resume", metavar="RUN", help="go on with the run in this folder; its options come from there")
+    p.add_argument("--device", help="where the networks are: cpu, cuda, cuda:1, ... (default: cpu)")
+    p.add_argument("--threads", type=int, help="of the networks' arithmetic; another number, other roundings (default: 1)")
+    p.add_argument("--workers", type=int, help="processes that run trajectories; any number, same result (default: 1)")
+    p.add_argument("--trace", action="store_true", help="write every decision to trace.jsonl")
+    p.add_argument("--no-figures", action="store_true", help="draw none")
+    p.add_argument("--profile", action="store_true", help="print where the time went")
+    group = p.add_argument_group("fields of the configuration", "In brackets: paper | maze; then the section or reading.")
+    for f in fields(Config):
+        flag, values = "--" + f.name.replace("_", "-"), [getattr(c, f.name) for c in CONFIGS.values()]
+        text = f"[{' | '.join(map(str, dict.fromkeys(values)))}] {f.metadata['meaning']}"
+        kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type, "metavar": f.type.__name__}
+        group.add_argument(flag, default=None, help=text.replace("%", "%%"), **kind)
+    return p
+
+
+def settings_of(args: argparse.Namespace) -> dict:
+    """What makes the run, from the command line: all of it goes to config.json."""
+    given = {f.name: getattr(args, f.name) for f in fields(Config) if getattr(args, f.name) is not None}
+    env = args.env or "maze"
+    config = replace(CONFIGS[args.config or ("maze" if env == "maze" else "paper")], **given)
+    options = {name: getattr(args, name) for name in ("level", "rom", "state") if getattr(args, name) is not None}
+    for name in ("threads", "workers"):
+        if (getattr(args, name) or 1) < 1:
+            raise InputError(f"{name} is {getattr(args, name)}: give 1 or more")
+    return {"method": "rbexplore", "env": env, "options": options | {"frame_size": config.frame_size},
+            "config": asdict(config), "device": args.device or "cpu", "threads": args.threads or 1,
+            "workers": args.workers or 1, "versions": {"python": platform.python_version(), "torch": torch.__version__,
+                                                       "numpy": np.__version__, "gymnasium": gymnasium.__version__}}
+
+
+def recorded_settings(args: argparse.Namespace) -> dict:
+    """The settings of the run that --resume names; what else is on the command line must agree with them."""
+    path = pathlib.Path(args.resume) / "config.json"
+    try:
+        settings = json.loads(path.read_text())
+        values = settings["config"] | settings["options"] | settings
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{path} cannot be read: {args.resume} holds no run that could be resumed") from None
+    for name, value in vars(args).items():
+        if name in values and name != "config" and value is not None and value != values[name]:
+            raise InputError(f"--{name.replace('_', '-')} {value} differs from {values[name]} in {path}: a resumed run keeps "
+                             "its options; leave it out, or begin anew with another --out")
+    return settings
+
+
+def prepare(settings: dict):
+    """Check the device, fix threads and determinism; return the algorithm and its executor."""
+    torch.set_num_threads(settings["threads"])
+    torch.use_deterministic_algorithms(True)
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS wants for that
+    try:
+        torch.zeros(1, device=settings["device"])
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise InputError(f"device {settings['device']} cannot be used ({reason}): give another --device, such as cpu") from None
+    try:
+        config = Config(**settings["config"])
+    except TypeError as error:
+        raise InputError(f"the configuration in config.json does not fit this version: {error}") from None
+    executor = None
+    if settings["workers"] > 1:
+        executor = ProcessPoolExecutor(settings["workers"], multiprocessing.get_context("spawn"), signal.signal,
+                                       (signal.SIGINT, signal.SIG_IGN))
+    env_fn = functools.partial(make_env, settings["env"], **settings["options"])
+    return RbExplore(env_fn, config, settings["device"], executor), executor
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command line. Returns the exit code: 0; 2 for an error that the user can put right; 130 after Ctrl-C."""
+    try:
+        return command(parser().parse_args(argv))
+    except (InputError, FloatingPointError) as error:
+        print(f"rbexplore: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def command(args: argparse.Namespace) -> int:
+    settings = recorded_settings(args) if args.resume else settings_of(args)
+    if not args.no_figures:
+        new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
+    started = time.monotonic()
+    algorithm, executor = prepare(settings)
+    folder = pathlib.Path(args.resume or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
+    run = Run(folder, settings, algorithm, args.trace)
+    run.load() if args.resume else run.create()
+    profile = Profile(algorithm, run) if args.profile else None
+    print(header(run))
+    stopped = False
+    try:
+        algorithm.run()
+    except KeyboardInterrupt:
+        stopped = True
+        print("\nstopped: going back to the last complete iteration", flush=True)
+        run.load()
+    finally:
+        if executor:
+            executor.shutdown(cancel_futures=True)
+    figures = [] if args.no_figures else draw_figures(run)
+    print(summary(run, figures, time.monotonic() - started, stopped))
+    if profile:
+        print(profile.table(time.monotonic() - started))
+    return 130 if stopped else 0
+
+
+def header(run: Run) -> str:
+    s, c, a = run.settings, run.settings["config"], run.algorithm
+    full = getattr(a.env, "full_coverage", None)
+    level = f", level {s['options'].get('level', 1)}" if s["env"] != "montezuma" else ""
+    begin = f", from step {a.steps:,} on" if a.steps else ""
+    return (f"RbExplore on {s['env']}{level}: {f'{full} units to cover' if full else 'full coverage is not known'}; seed {c['seed']}; "
+            f"{c['steps']:,} steps, {c['pretrain_steps']:,} of them pretraining{begin}\n"
+            f"{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), torch {s['versions']['torch']}; run folder {run.folder}\n"
+            + Run.COLUMNS)
+
+
+def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
+    a, full = run.algorithm, getattr(run.algorithm.env, "full_coverage", None)
+    times = sorted(a.discovered.values())
+    lines = [f"{'stopped' if stopped else 'done'} after {a.steps:,} steps and {seconds:.0f} s: {len(times)} "
+             + (f"of {full} units ({100 * len(times) / full:.1f} %), " if full else "units, ") + f"{len(a.graph.clusters)} clusters"]
+    if full:
+        marks = [(share, math.ceil(full * share / 100)) for share in (50, 90, 100)]
+        lines.append("steps to " + ", ".join(f"{share} %: {times[k - 1]:,}" if len(times) >= k else f"{share} %: not reached"
+                                             for share, k in marks))
+    lines.append(f"{run.folder}: config.json, metrics.csv, checkpoint.pt{', ' if figures else ''}{', '.join(figures)}")
+    if stopped:
+        lines.append(f"go on with: python rbexplore.py --resume {run.folder}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
