@@ -574,7 +574,8 @@ class Montezuma(EmulatorEnv):
         self._emulator.act(self._actions[action])
 
     def _ram(self):
-        return dict(zip(("room", "x", "y", "lives"), self._emulator.getRAM()[[3, 42, 43, 58]].tolist()))
+        room, x, y, lives = self._emulator.getRAM()[[3, 42, 43, 58]].tolist()
+        return {"room": room, "x": x, "y": y, "lives": lives}
 
     def unit(self) -> tuple[int, int, int]:
         """(room, x // 16, y // 16): a tenth of the screen's width, as a plate is of the Prince's room."""

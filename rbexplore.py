@@ -102,14 +102,16 @@ class Config:
 
     def __post_init__(self):
         for f in fields(self):
-            name, value, low, high = f.name, getattr(self, f.name), f.metadata["low"], f.metadata["high"]
-            if isinstance(value, bool) != (f.type is bool) or not isinstance(value, (int, f.type) if f.type is float else f.type):
-                raise InputError(f"{name} is {value!r}: it must be of type {f.type.__name__}")
-            if f.type is float and not math.isfinite(value) or low is not None and value < low or high is not None and value > high:
-                bounds = f"from {low} to {high}" if high is not None else f"of at least {low}" if low is not None else "that is finite"
-                raise InputError(f"{name} is {value}: give a number {bounds}")
-            if f.metadata["choices"] and value not in f.metadata["choices"]:
-                raise InputError(f"{name} is {value!r}: choose {' or '.join(f.metadata['choices'])}")
+            value, (low, high, choices) = getattr(self, f.name), (f.metadata[key] for key in ("low", "high", "choices"))
+            types = (int, float) if f.type is float else f.type
+            if not isinstance(value, types) or isinstance(value, bool) and f.type is not bool:
+                raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
+            if f.type is float and not math.isfinite(value):
+                raise InputError(f"{f.name} is {value}: give a finite number")
+            if low is not None and value < low or high is not None and value > high:
+                raise InputError(f"{f.name} is {value}: give {f'a number from {low} to {high}' if high else f'at least {low}'}")
+            if choices and value not in choices:
+                raise InputError(f"{f.name} is {value!r}: choose {' or '.join(choices)}")
         if self.n > self.N:
             raise InputError(f"n is {self.n} and N is {self.N}: a distance cannot be both similar and dissimilar; give n <= N")
         for name in ("trajectory_steps", "additional_steps"):
@@ -257,7 +259,8 @@ class RbExplore:
             reward = self.novelty.reward(tau.frames)  # (T,)
             found = np.flatnonzero(reward > self.config.beta)
             self.novel += [tau.snapshots[i] for i in found]
-            self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
+            if len(found):
+                self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
             states, novel = states + len(reward), novel + len(found)
         sample = self.rng("buffer").permutation(len(self.novel))[: self.config.L]
         additional = self.collect("additional", [self.novel[i] for i in sample], self.config.additional_steps)
@@ -882,21 +885,28 @@ class Run:
         self.save()
 
     def load(self) -> None:
-        """Go back to the last complete iteration; what came after it is forgotten."""
+        """Take the state of the last complete iteration from the checkpoint; writes nothing."""
         path = self.folder / "checkpoint.pt"
         try:
             state = torch.load(path, map_location=self.settings["device"], weights_only=True)
             self.rows, settings, self.trace_bytes = state["rows"], state["settings"], state["trace_bytes"]
-            unpack(self.algorithm, state["algorithm"]) if settings == self.settings else None
+            if settings == self.settings:
+                unpack(self.algorithm, state["algorithm"])
         except Exception as error:  # torch raises many kinds for a file that is cut short
             raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
                              "another --out") from None
         if settings != self.settings:
             raise InputError(f"{path} is of another configuration than config.json beside it: put the right one back, or "
                              "begin anew with another --out")
+
+    def resume(self) -> None:
+        """Go on from the last complete iteration; what came after it is forgotten."""
+        self.load()
         self.write_metrics()
         if self.tracing:
-            os.truncate(self.folder / "trace.jsonl", self.trace_bytes)
+            self.events = []
+            with open(self.folder / "trace.jsonl", "ab") as file:
+                file.truncate(self.trace_bytes)
 
     def save(self) -> None:
         if self.tracing:
@@ -935,18 +945,18 @@ class Run:
 
     def show(self, row: dict) -> None:
         """A line for an iteration."""
-        recent = self.rows[-5:]
-        pace = sum(r["seconds"] for r in recent) / max(1, row["steps"] - (self.rows[-6]["steps"] if len(self.rows) > 5 else 0))
+        before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
+        pace = sum(r["seconds"] for r in self.rows[-5:]) / max(1, row["steps"] - before)
         left = round(pace * (self.settings["config"]["steps"] - row["steps"]))
-
-        def f(name, form, scale=1):
-            return format(row[name] * scale, form) if row.get(name) is not None else format("-", ">" + form.split(".")[0])
-
-        covered = f("coverage", "6.1f", 100) if row["coverage"] is not None else f"{row['units']:>5}u"
-        line = (f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row['clusters']:9} {row['added']:5} {row['merged']:6} "
-                f"{covered} {f('r_loss', '8.3f')} {f('r_accuracy', '6.3f')} {f('r_true_positive', '6.3f')} "
-                f"{f('r_true_negative', '6.3f')} {f('novel_share', '6.1f', 100)} {row['seconds']:5.1f} {left // 60:4}:{left % 60:02}")
-        print(("\r" if self.live else "") + line, flush=True)
+        cells = [f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row['clusters']:9} {row['added']:5}{row['merged']:7}"]
+        rates = [(name, 6, 3, 1) for name in ("r_accuracy", "r_true_positive", "r_true_negative")]
+        for name, width, digits, scale in (("coverage", 6, 1, 100), ("r_loss", 8, 3, 1), *rates, ("novel_share", 6, 1, 100)):
+            value = row.get(name)
+            cells.append(f"{'-' if value is None else format(value * scale, f'.{digits}f'):>{width}}")
+        if row["coverage"] is None:
+            cells[1] = f"{row['units']:>5}u"
+        cells.append(f"{row['seconds']:5.1f} {left // 60:4}:{left % 60:02}")
+        print(("\r" if self.live else "") + " ".join(cells), flush=True)
         if row["phase"] == "explore":
             for name, what in (("r_true_positive", "every state new"), ("r_true_negative", "every state known")):
                 if row.get(name) is not None and row[name] < 0.2:
@@ -1085,6 +1095,39 @@ def centres_figure(a: RbExplore, most: int = 80) -> object:
     return figure
 
 
+# ------------------------------------------------------------------- the policy pi^p of section 3.2, checked and exported
+
+
+def verify(a: RbExplore) -> tuple[str, bool]:
+    """For every cluster: replay its actions from s_init, restore its snapshot, and compare both with its centre, exactly.
+    Returns a table, and whether all agree."""
+    lines, wrong = [f"{'cluster':>9}{'visits':>9}{'steps from s_init':>19}   replayed   restored"], 0
+    for v, cluster in a.graph.clusters.items():
+        actions = cluster.path.replay()
+        frame, ended = a.env.restore(a.snap_init), False
+        for action in actions:
+            ended = ended or a.env.step(action + int(a.env.action_space.start))[2]
+        if actions and not ended:
+            frame = a.env.restore(a.env.snapshot())
+        replayed, unit = np.array_equal(frame, cluster.frame) and not ended, a.env.unit()
+        restored = np.array_equal(a.env.restore(cluster.snapshot), cluster.frame)
+        replayed = replayed and unit == a.env.unit()
+        wrong += not (replayed and restored)
+        answers = ["exact" if good else "DIFFERS" for good in (replayed, restored)]
+        lines.append(f"{v:9}{cluster.visits:9,}{len(actions):19,}   {answers[0]:8}   {answers[1]}")
+    lines.append(f"{len(a.graph.clusters) - wrong} of {len(a.graph.clusters)} clusters are reached exactly, both ways")
+    return "\n".join(lines), not wrong
+
+
+def export_demos(a: RbExplore, path: pathlib.Path) -> None:
+    """The actions that lead from s_init to each centre, as demonstrations: actions[offsets[k]:offsets[k + 1]] lead to the
+    centre of cluster clusters[k], whose frame is centres[k]."""
+    demos = [np.frombuffer(v.path.replay(), np.uint8) for v in a.graph.clusters.values()]
+    arrays = {"clusters": np.array(list(a.graph.clusters)), "offsets": np.cumsum([0, *map(len, demos)]),
+              "actions": np.concatenate(demos), "centres": np.stack([v.frame for v in a.graph.clusters.values()])}
+    write_atomically(path, lambda f: np.savez_compressed(f, **arrays))
+
+
 # ---------------------------------------------------------------------------------------------------------- the profile
 
 
@@ -1154,6 +1197,9 @@ def parser() -> Parser:
     p.add_argument("--config", choices=list(CONFIGS), help="values of all fields below (default: maze for maze, else paper)")
     p.add_argument("--out", help="run folder (default: runs/<env>-<seed>)")
     p.add_argument("--resume", metavar="RUN", help="go on with the run in this folder; its options come from there")
+    p.add_argument("--verify", metavar="RUN", help="check that every cluster of this run is reached exactly, both by replaying "
+                   "its actions and by its snapshot; exit code 1 if one is not")
+    p.add_argument("--export-demos", metavar="FILE", help="with --verify: write the actions to each cluster to FILE (npz)")
     p.add_argument("--device", help="where the networks are: cpu, cuda, cuda:1, ... (default: cpu)")
     p.add_argument("--threads", type=int, help="of the networks' arithmetic; another number, other roundings (default: 1)")
     p.add_argument("--workers", type=int, help="processes that run trajectories; any number, same result (default: 1)")
@@ -1180,18 +1226,18 @@ def settings_of(args: argparse.Namespace) -> dict:
             raise InputError(f"{name} is {getattr(args, name)}: give 1 or more")
     return {"method": "rbexplore", "env": env, "options": options | {"frame_size": config.frame_size},
             "config": asdict(config), "device": args.device or "cpu", "threads": args.threads or 1,
-            "workers": args.workers or 1, "versions": {"python": platform.python_version(), "torch": torch.__version__,
+            "workers": args.workers or 1, "versions": {"python": platform.python_version(), "torch": str(torch.__version__),
                                                        "numpy": np.__version__, "gymnasium": gymnasium.__version__}}
 
 
-def recorded_settings(args: argparse.Namespace) -> dict:
-    """The settings of the run that --resume names; what else is on the command line must agree with them."""
-    path = pathlib.Path(args.resume) / "config.json"
+def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
+    """The settings of the run in the folder; what else is on the command line must agree with them."""
+    path = pathlib.Path(folder) / "config.json"
     try:
         settings = json.loads(path.read_text())
         values = settings["config"] | settings["options"] | settings
     except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(f"{path} cannot be read: {args.resume} holds no run that could be resumed") from None
+        raise InputError(f"{path} cannot be read: there is no run in {folder}; see what --out was") from None
     for name, value in vars(args).items():
         if name in values and name != "config" and value is not None and value != values[name]:
             raise InputError(f"--{name.replace('_', '-')} {value} differs from {values[name]} in {path}: a resumed run keeps "
@@ -1233,14 +1279,19 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def command(args: argparse.Namespace) -> int:
-    settings = recorded_settings(args) if args.resume else settings_of(args)
-    if not args.no_figures:
+    old = args.resume or args.verify
+    settings = recorded_settings(old, args) if old else settings_of(args)
+    if args.export_demos and not args.verify:
+        raise InputError("--export-demos goes with --verify RUN")
+    if not args.no_figures and not args.verify:
         new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
     started = time.monotonic()
     algorithm, executor = prepare(settings)
-    folder = pathlib.Path(args.resume or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
-    run = Run(folder, settings, algorithm, args.trace)
-    run.load() if args.resume else run.create()
+    folder = pathlib.Path(old or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
+    run = Run(folder, settings, algorithm, args.trace or (folder / "trace.jsonl").exists())
+    if args.verify:
+        return verified(run, args.export_demos)
+    run.resume() if args.resume else run.create()
     profile = Profile(algorithm, run) if args.profile else None
     print(header(run))
     stopped = False
@@ -1249,7 +1300,7 @@ def command(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         stopped = True
         print("\nstopped: going back to the last complete iteration", flush=True)
-        run.load()
+        run.resume()
     finally:
         if executor:
             executor.shutdown(cancel_futures=True)
@@ -1260,22 +1311,32 @@ def command(args: argparse.Namespace) -> int:
     return 130 if stopped else 0
 
 
+def verified(run: Run, demos: str | None) -> int:
+    run.load()
+    table, good = verify(run.algorithm)
+    print(table)
+    if demos:
+        export_demos(run.algorithm, pathlib.Path(demos))
+        print(f"demonstrations: {demos}")
+    return 0 if good else 1
+
+
 def header(run: Run) -> str:
     s, c, a = run.settings, run.settings["config"], run.algorithm
     full = getattr(a.env, "full_coverage", None)
     level = f", level {s['options'].get('level', 1)}" if s["env"] != "montezuma" else ""
+    units = f"{full} units to cover" if full else "full coverage is not known"
     begin = f", from step {a.steps:,} on" if a.steps else ""
-    return (f"RbExplore on {s['env']}{level}: {f'{full} units to cover' if full else 'full coverage is not known'}; seed {c['seed']}; "
-            f"{c['steps']:,} steps, {c['pretrain_steps']:,} of them pretraining{begin}\n"
-            f"{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), torch {s['versions']['torch']}; run folder {run.folder}\n"
-            + Run.COLUMNS)
+    return (f"RbExplore on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} of them "
+            f"pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
+            f"torch {s['versions']['torch']}; run folder {run.folder}\n{Run.COLUMNS}")
 
 
 def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
     a, full = run.algorithm, getattr(run.algorithm.env, "full_coverage", None)
     times = sorted(a.discovered.values())
     lines = [f"{'stopped' if stopped else 'done'} after {a.steps:,} steps and {seconds:.0f} s: {len(times)} "
-             + (f"of {full} units ({100 * len(times) / full:.1f} %), " if full else "units, ") + f"{len(a.graph.clusters)} clusters"]
+             f"{f'of {full} units ({100 * len(times) / full:.1f} %)' if full else 'units'}, {len(a.graph.clusters)} clusters"]
     if full:
         marks = [(share, math.ceil(full * share / 100)) for share in (50, 90, 100)]
         lines.append("steps to " + ", ".join(f"{share} %: {times[k - 1]:,}" if len(times) >= k else f"{share} %: not reached"
