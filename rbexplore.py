@@ -796,8 +796,8 @@ def stateful(a: RbExplore) -> tuple:
 
 
 def pack(a: RbExplore) -> dict:
-    """All that a run needs to go on, as tensors, numbers, strings and bytes, which load without unpickling objects. There
-    is no generator in it: each is made from the seed, the iteration and a purpose."""
+    """All that a run needs to go on, as tensors, numbers and strings (bytes as hex), which load without unpickling objects.
+    There is no generator in it: each is made from the seed, the iteration and a purpose."""
     number: dict[Path, int] = {}  # each path once, parents first
     for v in a.graph.clusters.values():
         for link in v.path.chain():
@@ -808,10 +808,10 @@ def pack(a: RbExplore) -> dict:
         "discovered": [(list(unit), step) for unit, step in a.discovered.items()],
         "networks": [part.state_dict() for part in stateful(a)],
         "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in (a.novelty.pixels, *a.novelty.errors)],
-        "buffer": list(a.novel),
+        "buffer": [snapshot.hex() for snapshot in a.novel],
         "replay": [(tensor(np.stack(p.states)), tensor(p.index), tensor(p.y), dict(p.counts)) for p in a.replay],
-        "paths": [(number.get(p.parent, -1), tensor(p.frames), list(p.actions)) for p in number],
-        "clusters": [(id, v.snapshot, number[v.path], v.parent, v.visits) for id, v in a.graph.clusters.items()],
+        "paths": [(number.get(p.parent, -1), tensor(p.frames), [x.hex() for x in p.actions]) for p in number],
+        "clusters": [(id, v.snapshot.hex(), number[v.path], v.parent, v.visits) for id, v in a.graph.clusters.items()],
         "arcs": [(*arc, visits) for arc, visits in a.graph.arcs.items()],
         "graph": [a.graph.created, a.graph.assigned, a.graph.refused],
     }
@@ -829,14 +829,14 @@ def unpack(a: RbExplore, state: dict) -> None:
         moments[-1].count, moments[-1].mean, moments[-1].m2 = count, mean.numpy(), m2.numpy()
     a.novelty.pixels = moments[0]
     a.novelty.errors = deque(moments[1:], a.config.novelty_window)
-    a.novel = state["buffer"]
+    a.novel = [bytes.fromhex(x) for x in state["buffer"]]
     replay = [Pairs(list(s.numpy()), index.numpy(), y.numpy(), Counter(c)) for s, index, y, c in state["replay"]]
     a.replay = deque(replay, a.config.replay_iterations)
     paths: list[Path] = []
     for parent, frames, actions in state["paths"]:
-        paths.append(Path(paths[parent] if parent >= 0 else None, frames.numpy(), tuple(actions)))
+        paths.append(Path(paths[parent] if parent >= 0 else None, frames.numpy(), tuple(map(bytes.fromhex, actions))))
     g = a.graph
-    g.clusters = {id: Cluster(paths[p].frames[-1], snapshot, paths[p], parent, visits)
+    g.clusters = {id: Cluster(paths[p].frames[-1], bytes.fromhex(snapshot), paths[p], parent, visits)
                   for id, snapshot, p, parent, visits in state["clusters"]}
     g.arcs, g.adjacent = {}, {v: set() for v in g.clusters}
     for start, end, visits in state["arcs"]:
