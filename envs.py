@@ -86,8 +86,8 @@ LEVELS = {
     ##_.______ ____^___._ #.____C___
     ##b______# ####__.A__ #_____._##
 
-    ##_.__^___ ____.__a## ##___.____
-    #____.#### ##_._____# ##____.___
+    ##_.__^___ ____.___## ##___.____
+    #____.#### ##_.____a# ##____.___
     #@_____### ##___##### #________#
     """,
     2: """
@@ -99,8 +99,8 @@ LEVELS = {
     ##_.______ ____^___._ #.____C___ ____D__.__
     ##b______# ####__.A__ #_____._## #.__^__e_#
 
-    ##_.__^___ ____.__a## ##___.____ ____._____
-    #____.#### ##_._____# ##____.___ __.___^___
+    ##_.__^___ ____.___## ##___.____ ____._____
+    #____.#### ##_.____a# ##____.___ __.___^___
     #@_____### ##___##### #________# #d__E___^#
     """,
     3: """
@@ -112,13 +112,13 @@ LEVELS = {
     ##_.___^__ ____^___._ #.____C___ ____D__.__
     ##b______# ####__.A__ #_____._## #.__^__e_#
 
-    ##_.__^___ ____.__a## ##___.__^_ ____._____
-    #____.#### ##_._____# ##____.___ __.___^___
+    ##_.__^___ ____.___## ##___.__^_ ____._____
+    #____.#### ##_.____a# ##____.___ __.___^___
     #@_____### ##___##### #_.______# #d__E___^#
 
     ##_^__.___ ___^_.____ _____.__^_ __________
     #_.__^____ _.__^_____ ___.___^__ ____._____
-    #___G____# #____^__g# #__^____h# #_^__H__^#
+    #___G____# #____^__g# #_^_____h# #_^__H__^#
     """,
 }
 
@@ -145,7 +145,7 @@ class Maze(PersistentEnv):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
-        if level not in LEVELS:
+        if level not in tuple(LEVELS):  # a tuple, since a list cannot be looked up in a dict
             raise InputError(f"unknown maze level {level!r}: there are {', '.join(map(str, LEVELS))}")
         if not isinstance(frame_size, int) or frame_size < 32:
             raise InputError(f"frame_size must be a whole number of pixels, 32 or more, and not {frame_size!r}")
@@ -160,7 +160,7 @@ class Maze(PersistentEnv):
         self.state = self.start
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._backgrounds: dict[tuple[int, str], np.ndarray] = {}
+        self._backgrounds: dict[tuple[int, int], np.ndarray] = {}
         self._sprites = {}
         for facing in (0, 1):
             for dead in (0, 1):
@@ -176,7 +176,7 @@ class Maze(PersistentEnv):
 
     def step(self, action: int):
         """One action, 0 to 6. Raises InputError for any other, and where the agent is already dead."""
-        if not 0 <= action < 7:
+        if action not in range(7):
             raise InputError(f"the maze has actions 0 to 6, and not {action!r}")
         if self.state[4]:
             raise InputError("the agent is dead: reset or restore the maze before the next step")

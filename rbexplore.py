@@ -188,7 +188,7 @@ class RbExplore:
         """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
         self.phase, self.novel, self.graph = "explore", [], Graph(self.s_init, self.snap_init, self.config)
         if self.unit_init is not None:
-            self.discovered[tuple(self.unit_init)] = self.steps
+            self.discovered[unit_key(self.unit_init)] = self.steps
         self.tell("restart")
 
     def theta_sim(self) -> float:
@@ -233,7 +233,7 @@ class RbExplore:
                     self.steps += 1
                     self.exploration_steps += purpose == "explore"
                     if purpose == "explore" and self.phase == "explore" and unit is not None:
-                        self.discovered.setdefault(tuple(unit), self.steps)
+                        self.discovered.setdefault(unit_key(unit), self.steps)
                 trajectories.append(tau)
                 self.tell("progress", step=purpose, done=len(trajectories), total=len(snapshots))
         return trajectories
@@ -326,6 +326,11 @@ def walk(env, snapshot: bytes, seed: list[int], steps: int, keep_snapshots: bool
         if truncated:
             break
     return Trajectory(np.stack(frames), snapshots if keep_snapshots else [], actions, units)
+
+
+def unit_key(unit) -> tuple:
+    """A coverage unit as a tuple of plain numbers or strings, whatever the environment makes it of."""
+    return tuple(np.ravel(unit).tolist())
 
 
 _worker = threading.local()  # an environment for each process, or thread, of an executor
@@ -427,12 +432,17 @@ class BasicBlock(nn.Module):
         return F.relu(self.residual(x) + self.shortcut(x))
 
 
+class SpatialMean(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.mean((2, 3))  # as AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA
+
+
 def resnet18(channels: int, out: int) -> nn.Module:
     """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
     layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
     for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
         layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
-    return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(512, out))
+    return nn.Sequential(*layers, SpatialMean(), nn.Linear(512, out))
 
 
 SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding
@@ -982,32 +992,34 @@ def draw_figures(run: Run) -> list[str]:
     unit_of = {}  # cluster -> coverage unit, by rolling back: G itself does not know units
     for v, cluster in a.graph.clusters.items():
         a.env.restore(cluster.snapshot)
-        unit_of[v] = a.env.unit()
+        if a.env.unit() is not None:
+            unit_of[v] = unit_key(a.env.unit())
     a.env.restore(a.snap_init)
     drawn = a.env.level_map() if hasattr(a.env, "level_map") else None
-    level, boxes = drawn or rooms_map(set(a.discovered) | {u for u in unit_of.values() if u is not None})
+    level, boxes, labels = (*drawn, []) if drawn else rooms_map({*a.discovered, *unit_of.values()})
     figures = {"coverage.png": coverage_figure([(run.settings["method"], [a])]), "centres.png": centres_figure(a)}
     if boxes:
-        figures["coverage_map.png"] = map_figure(a, level, boxes)
-        figures["graph.png"] = graph_figure(a, level, boxes, unit_of)
+        figures["coverage_map.png"] = map_figure(a, level, boxes, labels)
+        figures["graph.png"] = graph_figure(a, level, boxes, labels, unit_of)
     for name, figure in figures.items():
         write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
     return list(figures)
 
 
-def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict]:
-    """A stand-in where the environment draws no level: a panel for each room, a square for each unit visited in it."""
-    if not units:
-        return np.zeros((1, 1, 3), np.uint8), {}
-    rooms = sorted({u[:-2] for u in units})
-    xs, ys = [u[-2] if len(u) > 1 else u[-1] for u in units], [u[-1] if len(u) > 1 else 0 for u in units]
-    width, height, across, side = max(xs) - min(xs) + 2, max(ys) - min(ys) + 2, math.ceil(math.sqrt(len(rooms))), 12
-    boxes = {}
-    for u in units:
-        k = rooms.index(u[:-2])
-        x, y = (u[-2] if len(u) > 1 else u[-1]) - min(xs), (u[-1] if len(u) > 1 else 0) - min(ys)
-        boxes[u] = ((k % across * width + x) * side, (k // across * height + y) * side, side, side)
-    return np.full((math.ceil(len(rooms) / across) * height * side, across * width * side, 3), 40, np.uint8), boxes
+def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
+    """Where the environment draws no level: a panel for each room, in it a square for each unit (room, x, y) known.
+    Returns the picture, the box of each unit, and for each panel (x, y, name)."""
+    places = {u: (u[:-2], *((0, 0, *u)[-2:])) for u in units}  # (5,) is x = 0, y = 5 of the only room
+    rooms, xs, ys = (sorted({place[k] for place in places.values()}) for k in range(3))
+    if not units or not all(isinstance(x, int) for x in (*xs, *ys)):
+        return np.zeros((1, 1, 3), np.uint8), {}, []
+    width, height, across, side = xs[-1] - xs[0] + 2, ys[-1] - ys[0] + 3, math.ceil(math.sqrt(len(rooms))), 12
+    corner = {room: (k % across * width, k // across * height + 1) for k, room in enumerate(rooms)}
+    boxes = {u: ((corner[room][0] + x - xs[0]) * side, (corner[room][1] + y - ys[0]) * side, side, side)
+             for u, (room, x, y) in places.items()}
+    labels = [(x * side, y * side, "room " + " ".join(map(str, room))) for room, (x, y) in corner.items() if room]
+    rows = math.ceil(len(rooms) / across)
+    return np.full((rows * height * side, across * width * side, 3), 40, np.uint8), boxes, labels
 
 
 def coverage_curve(a) -> tuple[np.ndarray, np.ndarray]:
@@ -1033,19 +1045,21 @@ def coverage_figure(curves: list) -> object:
     return figure
 
 
-def map_axes(level: np.ndarray, title: str):
+def map_axes(level: np.ndarray, labels: list, title: str):
     figure = new_figure(10, 10 * level.shape[0] / level.shape[1] + 0.9)
     axes = figure.subplots()
     axes.imshow(level)
     axes.set(title=title, xticks=[], yticks=[])
+    for x, y, name in labels:
+        axes.text(x, y, name, color="white", fontsize=8, verticalalignment="bottom")
     return figure, axes
 
 
-def map_figure(a, level: np.ndarray, boxes: dict) -> object:
+def map_figure(a, level: np.ndarray, boxes: dict, labels: list) -> object:
     """The level, its visited units coloured by the step of the first visit, the others crossed out."""
     full = getattr(a.env, "full_coverage", None)
     share = f"{100 * len(a.discovered) / full:.1f} % of {full} units" if full else f"{len(a.discovered)} units"
-    figure, axes = map_axes(level, f"coverage after {a.steps:,} steps: {share}")
+    figure, axes = map_axes(level, labels, f"coverage after {a.steps:,} steps: {share}")
     heat = np.full(level.shape[:2], np.nan)
     for unit, (x, y, w, h) in boxes.items():
         if unit in a.discovered:
@@ -1057,9 +1071,9 @@ def map_figure(a, level: np.ndarray, boxes: dict) -> object:
     return figure
 
 
-def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, unit_of: dict) -> object:
+def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, labels: list, unit_of: dict) -> object:
     """G over the level: a disc for each cluster, its area by the visits; a line for each arc, its width by the visits."""
-    figure, axes = map_axes(level, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
+    figure, axes = map_axes(level, labels, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
     place, crowd = {}, Counter()
     for v, unit in unit_of.items():
         if unit in boxes:
@@ -1090,7 +1104,7 @@ def centres_figure(a: RbExplore, most: int = 80) -> object:
     for axes in panels:
         axes.axis("off")
     for axes, v in zip(panels, shown, strict=False):
-        axes.imshow(a.graph.clusters[v].frame, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        axes.imshow(a.graph.clusters[v].frame.squeeze(), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
         axes.set_title(f"{v}: {a.graph.clusters[v].visits:,}", fontsize=7)
     return figure
 
