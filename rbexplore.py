@@ -29,6 +29,7 @@ unclear. The README lists both.
 
 import argparse
 import copy
+import csv
 import functools
 import itertools
 import json
@@ -38,12 +39,13 @@ import os
 import pathlib
 import platform
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 
 import gymnasium
@@ -52,7 +54,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from envs import InputError, check_contract, make_env
+from envs import InputError, Maze, check_contract, make_env
 
 # ---------------------------------------------------------------------------- configuration (6.1; S6.1-05, 08, 09, 12)
 
@@ -60,6 +62,21 @@ from envs import InputError, check_contract, make_env
 def option(default, meaning, low=None, high=None, choices=None):
     """A field of the configuration: its meaning is the text of --help, its range is checked."""
     return field(default=default, metadata={"meaning": meaning, "low": low, "high": high, "choices": choices})
+
+
+def check_fields(config) -> None:
+    """Raise InputError for a value of the wrong type or out of its range."""
+    for f in fields(config):
+        value, (low, high, choices) = getattr(config, f.name), (f.metadata[key] for key in ("low", "high", "choices"))
+        types = (int, float) if f.type is float else f.type
+        if not isinstance(value, types) or isinstance(value, bool) and f.type is not bool:
+            raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
+        if f.type is float and not math.isfinite(value):
+            raise InputError(f"{f.name} is {value}: give a finite number")
+        if low is not None and value < low or high is not None and value > high:
+            raise InputError(f"{f.name} is {value}: give {f'a number from {low} to {high}' if high else f'at least {low}'}")
+        if choices and value not in choices:
+            raise InputError(f"{f.name} is {value!r}: choose {' or '.join(choices)}")
 
 
 @dataclass(frozen=True)
@@ -101,17 +118,7 @@ class Config:
     rnd_batch: int = option(256, "states in a batch (R18)", 1)
 
     def __post_init__(self):
-        for f in fields(self):
-            value, (low, high, choices) = getattr(self, f.name), (f.metadata[key] for key in ("low", "high", "choices"))
-            types = (int, float) if f.type is float else f.type
-            if not isinstance(value, types) or isinstance(value, bool) and f.type is not bool:
-                raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
-            if f.type is float and not math.isfinite(value):
-                raise InputError(f"{f.name} is {value}: give a finite number")
-            if low is not None and value < low or high is not None and value > high:
-                raise InputError(f"{f.name} is {value}: give {f'a number from {low} to {high}' if high else f'at least {low}'}")
-            if choices and value not in choices:
-                raise InputError(f"{f.name} is {value!r}: choose {' or '.join(choices)}")
+        check_fields(self)
         if self.n > self.N:
             raise InputError(f"n is {self.n} and N is {self.N}: a distance cannot be both similar and dissimilar; give n <= N")
         for name in ("trajectory_steps", "additional_steps"):
@@ -166,6 +173,8 @@ class RbExplore:
 
     def iterate(self) -> dict:
         """One iteration: the paper's five steps in the paper's order. Returns its metrics."""
+        if self.steps >= self.config.steps:
+            raise InputError(f"the budget of {self.config.steps} steps is spent: give more steps to go on")
         if self.phase == "pretrain" and self.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
@@ -791,12 +800,348 @@ class RND:
 
 
 # ######################################################################################################################
-# Nothing below this line belongs to the algorithm: the run folder, its figures, the command line.
+# Nothing below this line belongs to the algorithm: the methods compared, the run folder, its figures, the command line.
 # ######################################################################################################################
+
+# ------------------------------------------------------------------- the methods compared (6.2; S6.2-03, S6.2-04, R2, R27)
+
+
+class Baseline:
+    """What the compared methods share with RbExplore: one step counter, one coverage (R2, R25), seeds by purpose, and the
+    interface that the run folder uses. A subclass has advance(): spend the steps of one iteration, and learn from them."""
+
+    run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
+
+    def __init__(self, env_fn: Callable, config: Config):
+        self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
+        check_contract(self.env)
+        self.s_init = self.env.reset(seed=config.seed)[0].copy()
+        self.snap_init, unit = self.env.snapshot(), self.env.unit()
+        self.iteration = self.steps = self.exploration_steps = 0
+        self.discovered: dict[tuple, int] = {} if unit is None else {unit_key(unit): 0}
+
+    def iterate(self) -> dict:
+        """One iteration. Returns its metrics."""
+        self.iteration += 1
+        self.row = {"iteration": self.iteration, "phase": self.phase}
+        self.tell("iteration", **self.row)
+        self.advance()
+        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
+        self.row |= {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
+                     "coverage": units / full if full else None}
+        self.tell("row", row=self.row)
+        return self.row
+
+    def step(self, action: int) -> tuple[np.ndarray, bool, bool]:
+        """One step of the environment, counted and covered as RbExplore's: the frame, terminated, truncated."""
+        frame, _, terminated, truncated, _ = self.env.step(action + int(self.env.action_space.start))
+        self.steps, self.exploration_steps, unit = self.steps + 1, self.exploration_steps + 1, self.env.unit()
+        if unit is not None:
+            self.discovered.setdefault(unit_key(unit), self.steps)
+        return frame, terminated, truncated
+
+    def state(self) -> dict:
+        """All that the method needs to go on, as tensors, numbers and strings (bytes as hex)."""
+        return {"counters": [self.iteration, self.steps, self.exploration_steps],
+                "discovered": [(list(unit), step) for unit, step in self.discovered.items()]}
+
+    def load(self, state: dict) -> None:
+        self.iteration, self.steps, self.exploration_steps = state["counters"]
+        self.discovered = {tuple(unit): step for unit, step in state["discovered"]}
+
+
+class Random(Baseline):
+    """Uniform over the actions, always from the start, M episodes an iteration: nothing is stored or rolled back to."""
+
+    def advance(self) -> None:
+        rng = self.rng("explore")
+        for _ in range(self.config.M):
+            self.env.reset(seed=self.config.seed)
+            for _ in range(min(self.config.trajectory_steps, self.config.steps - self.steps)):
+                if any(self.step(int(rng.integers(self.env.action_space.n)))[1:]):
+                    break
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """PPO's settings, the same for RND and ICM: Burda et al. 2019 (table 5, or their code), and Pathak et al. 2017 (R27)."""
+
+    actors: int = option(128, "environments: snapshots that one environment takes turns at (Burda)", 1)
+    rollout_steps: int = option(128, "steps of an actor an iteration (Burda)", 1)
+    episode_steps: int = option(4500, "longest episode, steps: 18,000 frames (Burda)", 1)
+    stack: int = option(4, "latest frames that policy and value see (Burda)", 1)
+    gamma: float = option(0.99, "discount of the intrinsic reward (Burda)", 0, 1)
+    gae_lambda: float = option(0.95, "lambda of GAE (Burda)", 0, 1)
+    episodic: bool = option(False, "returns end with their episode; intrinsic ones do not (Burda)")
+    learning_rate: float = option(1e-4, "Adam's, for PPO and ICM; RND has rnd_learning_rate (Burda)", 0)
+    passes: int = option(4, "passes over a rollout (Burda: epochs)", 1)
+    minibatches: int = option(4, "minibatches a pass (Burda)", 1)
+    clip: float = option(0.1, "PPO's bound on the change of a probability (Burda)", 0)
+    entropy: float = option(0.001, "weight of the entropy (Burda)", 0)
+    value_weight: float = option(0.5, "weight of the value's squared error (Burda's code)", 0)
+    standardise: bool = option(False, "advantages have mean 0 and deviation 1 in a minibatch; not so in Burda's code")
+    bonus_share: float = option(0.25, "share of the experience that trains the bonus: 32 actors' of 128 (Burda)", 0, 1)
+    hidden: int = option(448, "width of the layer before policy and value, and of ICM's models (Burda's code)", 1)
+    icm_beta: float = option(0.2, "weight of ICM's forward loss; 1 - it of the inverse loss (Pathak)", 0, 1)
+    __post_init__ = check_fields
+
+
+# The maze's: 8 actors, so that 100,000 steps make 97 updates and not 6, each of which then has to count; one frame shows all
+# that four would; the longest way from the start is 61 steps.
+PPO_CONFIGS = {"paper": PPOConfig(), "maze": PPOConfig(actors=8, episode_steps=150, stack=1, learning_rate=1e-3, standardise=True,
+                                                       bonus_share=1.0, hidden=128)}
+
+
+class RNDBonus:
+    """Burda et al. 2019, 2.2 and 2.4: the error of RND, the one of RbExplore's novelty, on the state arrived at."""
+
+    def __init__(self, config: Config, ppo: PPOConfig, shape: tuple, actions: int, device: str):
+        self.rnd = RND(config, shape, device)
+        self.parts, self.moments = (self.rnd.target, self.rnd.predictor, self.rnd.optimiser), (self.rnd.pixels,)
+
+    @torch.no_grad()
+    def reward(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Frames (B, H, W), actions (B,), frames (B, H, W) -> (B,). The pixels' statistics come first, as there is no error
+        without them: the first rollout, of a policy still uniform, is Burda et al.'s random agent."""
+        for part in chunks(after):
+            self.rnd.pixels.join(Moments(part))
+        return np.concatenate([self.rnd.distance(part).cpu().numpy() for part in chunks(after)])
+
+    def update(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> dict[str, float]:
+        return {"rnd_loss": float(self.rnd.update(after).mean())}
+
+
+class ICM(nn.Module):
+    """Pathak et al. 2017: the error of a forward model, in the features of an encoder that learns by the inverse model
+    alone. Their frames, layers and width are RND's and PPO's here, so that nothing differs but the bonus."""
+
+    def __init__(self, config: Config, ppo: PPOConfig, shape: tuple, actions: int, device: str):
+        super().__init__()
+        d, w, self.actions, self.beta, self.device = config.rnd_features, ppo.hidden, actions, ppo.icm_beta, device
+        with torch.random.fork_rng(devices=[]):
+            self.encoder = convolutions(shape, d, SMALL if config.rnd_encoder == "small" else NATURE, norm=False)
+            self.inverse_model = nn.Sequential(nn.Linear(2 * d, w), nn.ReLU(), nn.Linear(w, actions))
+            self.forward_model = nn.Sequential(nn.Linear(d + actions, w), nn.ReLU(), nn.Linear(w, d))
+        self.optimiser = torch.optim.Adam(initialise(self, config.seed + 3).to(device).parameters(), lr=ppo.learning_rate)
+        self.parts, self.moments = (self, self.optimiser), ()
+
+    def losses(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """Frames (B, H, W), actions (B,), frames (B, H, W) -> inverse and forward losses (B,), (B,): equations 3 and 5."""
+        phi, phi_next = self.encoder(to_input(np.concatenate([before, after]), self.device)).chunk(2)  # (B, d) each
+        a = torch.from_numpy(actions).to(self.device)
+        inverse = F.cross_entropy(self.inverse_model(torch.cat([phi, phi_next], 1)), a, reduction="none")
+        guess = self.forward_model(torch.cat([phi.detach(), F.one_hot(a, self.actions)], 1))  # (B, d)
+        return inverse, (guess - phi_next.detach()).square().sum(1) / 2
+
+    @torch.no_grad()
+    def reward(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Equation 6, (B,), without its factor eta: PPO divides the reward by its own scale in any case."""
+        parts = zip(chunks(before), chunks(actions), chunks(after), strict=True)
+        return np.concatenate([self.losses(*part)[1].cpu().numpy() for part in parts])
+
+    def update(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> dict[str, float]:
+        """A step on equation 7, whose policy term is PPO's own."""
+        inverse, forward = (loss.mean() for loss in self.losses(before, actions, after))
+        self.optimiser.zero_grad()
+        ((1 - self.beta) * inverse + self.beta * forward).backward()
+        self.optimiser.step()
+        return {"inverse_loss": finite(inverse, "ICM's inverse model"), "forward_loss": finite(forward, "ICM's forward model")}
+
+
+def gae(rewards, values, last, ended, at_end, gamma: float, lam: float, episodic: bool) -> np.ndarray:
+    """Generalised advantage estimation (Schulman et al. 2016, equation 16). All (T, K) but `last`, (K,): values of the states
+    acted in, and of those after the rollout. An episodic return ends with its episode, with `at_end`: 0 after a death, the
+    value of the last state where only time ran out. Others go on, with the value of the next episode's first state."""
+    following, cut = np.concatenate([values[1:], last[None]]), ended & episodic
+    advantages, tail = rewards + gamma * np.where(cut, at_end, following) - values, 0.0
+    for t in reversed(range(len(rewards))):
+        advantages[t] = tail = advantages[t] + gamma * lam * ~cut[t] * tail
+    return advantages
+
+
+class PPO(Baseline):
+    """Proximal policy optimisation (Schulman et al. 2017) of a bonus, RNDBonus or ICM, alone: the environment's rewards are
+    ignored. The actors are snapshots of one environment, which plays them in turn: emulators allow no second one."""
+
+    def __init__(self, env_fn: Callable, config: Config, device: str, ppo: PPOConfig, bonus: Callable):
+        super().__init__(env_fn, config)
+        shape, self.n, self.ppo, self.device = self.s_init.shape, int(self.env.action_space.n), ppo, device
+        self.channels, layers = channels_of(shape), SMALL if config.rnd_encoder == "small" else NATURE
+        with torch.random.fork_rng(devices=[]):
+            self.net = nn.Sequential(convolutions((*shape[:2], self.channels * ppo.stack), ppo.hidden, layers, norm=False),
+                                     nn.ReLU(), nn.Linear(ppo.hidden, self.n + 1))
+        initialise(self.net, config.seed + 4).to(device)
+        self.net[-1].weight.data *= 0.01  # the first policy is uniform, the first values are 0
+        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=ppo.learning_rate)
+        self.bonus = bonus(config, ppo, shape, self.n, device)
+        self.sums, self.returns = np.zeros(ppo.actors), Moments()  # discounted sums of the bonus; their moments
+        self.parts, self.moments = (self.net, self.optimiser, *self.bonus.parts), (self.returns, *self.bonus.moments)
+        self.snapshots, self.ages = [self.snap_init] * ppo.actors, np.zeros(ppo.actors, np.int64)
+        self.seen = np.stack([self.first(self.s_init)] * ppo.actors)  # (K, H, W, C * stack)
+
+    def first(self, frame: np.ndarray) -> np.ndarray:
+        """What is seen at the start of an episode: its frame, (H, W) or (H, W, C), `stack` times, (H, W, C * stack)."""
+        return np.tile(frame.reshape(*frame.shape[:2], -1), self.ppo.stack)
+
+    def act(self, seen: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, H, W, C * stack) -> log-probabilities (B, A), values (B,)."""
+        out = self.net(to_input(seen, self.device))
+        return F.log_softmax(out[:, :-1], 1), out[:, -1]
+
+    @torch.no_grad()
+    def one(self, k: int) -> tuple[np.ndarray, float]:
+        """Log-probabilities (A,) and value of what actor k sees."""
+        logp, value = self.act(self.seen[k : k + 1])
+        return logp[0].cpu().numpy(), value.item()
+
+    def advance(self) -> None:
+        """A rollout, and several passes over it, of PPO and of the bonus."""
+        p, rng, (seen, actions, logp, after, values, *ends) = self.ppo, self.rng("novelty"), self.rollout()
+        size, before = actions.size, seen[..., -self.channels :].reshape(after.shape)
+        transitions = [x.reshape(size, *x.shape[2:]) for x in (before, actions, after)]
+        bonus = self.bonus.reward(*transitions)
+        advantages = gae(self.scaled(bonus.reshape(actions.shape)), values, *ends, p.gamma, p.gae_lambda, p.episodic)
+        experience = [x.reshape(size, *x.shape[2:]) for x in (seen, actions, logp, advantages, advantages + values)]
+        losses: dict[str, list] = {"bonus": [bonus.mean()]}
+        for _ in range(p.passes):
+            for batch in np.array_split(rng.permutation(size), min(p.minibatches, size)):
+                new = self.update(*(x[batch] for x in experience))
+                kept = batch[rng.random(len(batch)) < p.bonus_share]
+                if len(kept):
+                    new |= self.bonus.update(*(x[kept] for x in transitions))
+                for name, loss in new.items():
+                    losses.setdefault(name, []).append(loss)
+        self.row |= {name: float(np.mean(values)) for name, values in losses.items()}
+
+    def rollout(self) -> tuple:
+        """T steps of each of K actors, and none beyond the budget (S6.2-04)."""
+        p, rng, left = self.ppo, self.rng("explore"), self.config.steps - self.steps
+        T, K = max(1, min(p.rollout_steps, left // p.actors)), min(p.actors, left)
+        seen, after = np.empty((T, K, *self.seen.shape[1:]), np.uint8), np.empty((T, K, *self.s_init.shape), np.uint8)
+        actions, ended, last = np.empty((T, K), np.int64), np.zeros((T, K), bool), np.empty(K)
+        logp, values, at_end = np.zeros((3, T, K))
+        for k in range(K):
+            self.env.restore(self.snapshots[k])
+            for t in range(T):
+                policy, values[t, k] = self.one(k)
+                action = int((policy + rng.gumbel(size=self.n)).argmax())  # a sample of the policy
+                seen[t, k], actions[t, k], logp[t, k] = self.seen[k], action, policy[action]
+                after[t, k], terminated, truncated = self.step(action)
+                self.ages[k] += 1
+                self.seen[k] = np.roll(self.seen[k], -self.channels, -1)
+                self.seen[k, ..., -self.channels :] = after[t, k].reshape(*self.seen.shape[1:3], -1)
+                ended[t, k] = terminated or truncated or self.ages[k] >= p.episode_steps
+                if ended[t, k]:
+                    at_end[t, k] = 0 if terminated else self.one(k)[1]
+                    self.seen[k], self.ages[k] = self.first(self.env.reset(seed=self.config.seed)[0]), 0
+            self.snapshots[k], last[k] = self.env.snapshot(), self.one(k)[1]
+            self.tell("progress", step="explore", done=k + 1, total=K)
+        return seen, actions, logp, after, values, last, ended, at_end
+
+    def scaled(self, bonus: np.ndarray) -> np.ndarray:
+        """The bonus (T, K) over the standard deviation of its discounted sums so far, along the time of each actor (Burda et al.
+        2019, 2.4, and their code)."""
+        sums, K = np.empty(bonus.shape), bonus.shape[1]
+        for t, now in enumerate(bonus):
+            sums[t] = self.sums[:K] = self.ppo.gamma * self.sums[:K] + now
+        self.returns.join(Moments(sums.ravel()))
+        return bonus / max(math.sqrt(self.returns.m2 / self.returns.count), 1e-8)
+
+    def update(self, seen, actions, logp, advantages, targets) -> dict[str, float]:
+        """A step on B states: the clipped objective, the value's squared error and the entropy (equations 7 and 9)."""
+        p, (new, values) = self.ppo, self.act(seen)
+        logp, advantages, targets = (torch.from_numpy(x).to(values) for x in (logp, advantages, targets))  # (B,)
+        if p.standardise:
+            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
+        ratio = (new[range(len(actions)), actions] - logp).exp()
+        gain = torch.min(ratio * advantages, ratio.clamp(1 - p.clip, 1 + p.clip) * advantages).mean()
+        value_loss, entropy = (values - targets).square().mean(), -(new.exp() * new).sum(1).mean()
+        self.optimiser.zero_grad()
+        loss = p.value_weight * value_loss - gain - p.entropy * entropy
+        loss.backward()
+        self.optimiser.step()
+        finite(loss, "PPO")
+        return {"value_loss": value_loss.item(), "entropy": entropy.item()}
+
+    def state(self) -> dict:
+        tensor = torch.as_tensor
+        return super().state() | {
+            "networks": [part.state_dict() for part in self.parts],
+            "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in self.moments],
+            "actors": [[x.hex() for x in self.snapshots], tensor(self.seen), tensor(self.ages), tensor(self.sums)]}
+
+    def load(self, state: dict) -> None:
+        super().load(state)
+        for part, saved in zip(self.parts, state["networks"], strict=True):
+            part.load_state_dict(saved)
+        for m, (count, mean, m2) in zip(self.moments, state["moments"], strict=True):
+            m.count, m.mean, m.m2 = count, mean.cpu().numpy(), m2.cpu().numpy()
+        snapshots, *rest = state["actors"]
+        self.snapshots, (self.seen, self.ages, self.sums) = list(map(bytes.fromhex, snapshots)), (x.cpu().numpy() for x in rest)
+
+
+class Cells(nn.Module):
+    """Cells in R's place: 1 for states of one cell, else 0. embed: frames (T, H, W) uint8 -> cells (T, d)."""
+
+    def __init__(self, embed: Callable):
+        super().__init__()
+        self.embed, self.optimiser = embed, nn.Identity()  # nothing is trained: both have an empty state_dict
+        self.fit, self.rates = lambda *unused: None, lambda *unused: {}
+
+    def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
+        """Cells (K, d) and (K, d) or (d,) -> (K,)."""
+        return (first == second).all(1).double().numpy()
+
+
+def coarse(frames: np.ndarray) -> torch.Tensor:
+    """Cells without domain knowledge (Ecoffet et al. 2019): gray, 11 x 8 areas, 8 levels: (T, H, W) -> (T, 88) uint8."""
+    areas = [F.interpolate(to_input(part, "cpu").mean(1, keepdim=True), (8, 11), mode="area") for part in chunks(frames)]
+    return (torch.cat(areas).flatten(1) * 8).clamp(max=7).byte()
+
+
+class ExactMaze(Maze):
+    """The maze with its whole state, the snapshot, over the first pixels of each frame."""
+
+    def _frame(self) -> np.ndarray:
+        frame, state = super()._frame().copy(), np.frombuffer(self.snapshot(), np.uint8)
+        frame[0, : len(state)] = state
+        return frame
+
+
+def exact(frames: np.ndarray) -> torch.Tensor:
+    """Exact states as cells: (T, H, W) -> (T, W) uint8, the first row of ExactMaze's frames."""
+    return torch.from_numpy(frames[:, 0].copy())
+
+
+METHODS = ("rbexplore", "rnd", "icm", "random", "cells", "oracle")
+
+
+def config_of(method: str, config: Config, **given) -> Config:
+    """The configuration with the given values, less the steps that serve a learned R alone: pretraining, additional ones."""
+    return replace(config, **given | ({} if method == "rbexplore" else {"pretrain_steps": 0, "L": 0}))
+
+
+def make_method(method: str, env_fn: Callable, config: Config, device: str = "cpu", executor=None, ppo: PPOConfig | None = None):
+    """RbExplore, or a method with its interface. Raises InputError for the oracle of anything but the maze."""
+    config = config_of(method, config)
+    if method in ("rnd", "icm"):
+        return PPO(env_fn, config, device, ppo or PPOConfig(), RNDBonus if method == "rnd" else ICM)
+    if method == "random":
+        return Random(env_fn, config)
+    if method == "oracle":
+        maze = env_fn()
+        if not isinstance(maze, Maze):
+            raise InputError("--method oracle knows the exact states of the maze alone: give --env maze, or another method")
+        env_fn = functools.partial(ExactMaze, maze.level, maze.frame_size)
+    a = RbExplore(env_fn, config, device, executor)
+    if method in ("cells", "oracle"):
+        a.similarity = Cells(exact if method == "oracle" else coarse)
+    return a
+
 
 METRICS = ("iteration", "phase", "steps", "exploration_steps", "coverage", "units", "clusters", "added", "merged",
            "theta_sim", "r_loss", "r_accuracy", "r_true_positive", "r_true_negative", "novel_share", "additional",
-           "rnd_loss", "memory_mb", "seconds")
+           "rnd_loss", "bonus", "inverse_loss", "forward_loss", "value_loss", "entropy", "memory_mb", "seconds")
 
 # --------------------------------------------------------------------------------------- the state of a run, as plain data
 
@@ -808,6 +1153,8 @@ def stateful(a: RbExplore) -> tuple:
 def pack(a: RbExplore) -> dict:
     """All that a run needs to go on, as tensors, numbers and strings (bytes as hex), which load without unpickling objects.
     There is no generator in it: each is made from the seed, the iteration and a purpose."""
+    if isinstance(a, Baseline):
+        return a.state()
     number: dict[Path, int] = {}  # each path once, parents first
     for v in a.graph.clusters.values():
         for link in v.path.chain():
@@ -829,6 +1176,8 @@ def pack(a: RbExplore) -> dict:
 
 def unpack(a: RbExplore, state: dict) -> None:
     """Put a packed state into an algorithm of the same configuration."""
+    if isinstance(a, Baseline):
+        return a.load(state)
     a.phase, a.iteration, a.steps, a.exploration_steps = state["counters"]
     a.discovered = {tuple(unit): step for unit, step in state["discovered"]}
     for part, saved in zip(stateful(a), state["networks"], strict=True):
@@ -856,6 +1205,8 @@ def unpack(a: RbExplore, state: dict) -> None:
 
 def memory(a: RbExplore) -> float:
     """Megabytes of frames and snapshots that G and B hold."""
+    if isinstance(a, Baseline):
+        return 0.0
     links = {link for v in a.graph.clusters.values() for link in v.path.chain()}
     held = [*(v.snapshot for v in a.graph.clusters.values()), *a.novel]
     return round((sum(link.frames.nbytes for link in links) + sum(map(len, held))) / 2**20, 3)
@@ -958,7 +1309,8 @@ class Run:
         before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
         pace = sum(r["seconds"] for r in self.rows[-5:]) / max(1, row["steps"] - before)
         left = round(pace * (self.settings["config"]["steps"] - row["steps"]))
-        cells = [f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row['clusters']:9} {row['added']:5}{row['merged']:7}"]
+        cells = [f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row.get('clusters', '-'):>9} "
+                 f"{row.get('added', '-'):>5}{row.get('merged', '-'):>7}"]
         rates = [(name, 6, 3, 1) for name in ("r_accuracy", "r_true_positive", "r_true_negative")]
         for name, width, digits, scale in (("coverage", 6, 1, 100), ("r_loss", 8, 3, 1), *rates, ("novel_share", 6, 1, 100)):
             value = row.get(name)
@@ -971,7 +1323,7 @@ class Run:
             for name, what in (("r_true_positive", "every state new"), ("r_true_negative", "every state known")):
                 if row.get(name) is not None and row[name] < 0.2:
                     print(f"       warning: {name} is {row[name]:.2f}: R finds {what}, so G tells little")
-        if self.algorithm.graph.refused and row["clusters"] >= self.algorithm.config.max_clusters:
+        if row.get("clusters") and self.algorithm.graph.refused and row["clusters"] >= self.algorithm.config.max_clusters:
             print(f"       max_clusters has kept {self.algorithm.graph.refused} states from making a cluster so far")
 
 
@@ -990,17 +1342,20 @@ def draw_figures(run: Run) -> list[str]:
     """Draw what the run has found so far; returns the names of the files."""
     a, folder = run.algorithm, run.folder
     unit_of = {}  # cluster -> coverage unit, by rolling back: G itself does not know units
-    for v, cluster in a.graph.clusters.items():
+    graph = None if isinstance(a, Baseline) else a.graph
+    for v, cluster in graph.clusters.items() if graph else ():
         a.env.restore(cluster.snapshot)
         if a.env.unit() is not None:
             unit_of[v] = unit_key(a.env.unit())
     a.env.restore(a.snap_init)
     drawn = a.env.level_map() if hasattr(a.env, "level_map") else None
     level, boxes, labels = (*drawn, []) if drawn else rooms_map({*a.discovered, *unit_of.values()})
-    figures = {"coverage.png": coverage_figure([(run.settings["method"], [a])]), "centres.png": centres_figure(a)}
+    figures = {"coverage.png": coverage_figure([(run.settings["method"], [a])])}
+    if graph:
+        figures["centres.png"] = centres_figure(a)
     if boxes:
         figures["coverage_map.png"] = map_figure(a, level, boxes, labels)
-        figures["graph.png"] = graph_figure(a, level, boxes, labels, unit_of)
+        figures |= {"graph.png": graph_figure(a, level, boxes, labels, unit_of)} if graph else {}
     for name, figure in figures.items():
         write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
     return list(figures)
@@ -1060,15 +1415,19 @@ def map_figure(a, level: np.ndarray, boxes: dict, labels: list) -> object:
     full = getattr(a.env, "full_coverage", None)
     share = f"{100 * len(a.discovered) / full:.1f} % of {full} units" if full else f"{len(a.discovered)} units"
     figure, axes = map_axes(level, labels, f"coverage after {a.steps:,} steps: {share}")
+    figure.colorbar(draw_map(axes, level, boxes, a.discovered, a.steps), label="step of the first visit", shrink=0.8)
+    return figure
+
+
+def draw_map(axes, level: np.ndarray, boxes: dict, discovered: dict[tuple, int], steps: int):
+    axes.imshow(level)
     heat = np.full(level.shape[:2], np.nan)
     for unit, (x, y, w, h) in boxes.items():
-        if unit in a.discovered:
-            heat[y : y + h, x : x + w] = a.discovered[unit]
+        if unit in discovered:
+            heat[y : y + h, x : x + w] = discovered[unit]
         else:
             axes.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
-    image = axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=a.steps)
-    figure.colorbar(image, label="step of the first visit", shrink=0.8)
-    return figure
+    return axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=steps)
 
 
 def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, labels: list, unit_of: dict) -> object:
@@ -1154,6 +1513,8 @@ class Profile:
     def __init__(self, algorithm: RbExplore, run: Run):
         self.seconds, self.step, self.depth = Counter(), "run folder, start", 0
         a = algorithm
+        if isinstance(a, Baseline) or isinstance(a.similarity, Cells):
+            raise InputError("--profile is for --method rbexplore")
         for name in self.STEPS:
             self.wrap(a, name, None)
         for name in ("step", "snapshot", "restore", "unit"):
@@ -1193,6 +1554,113 @@ class Profile:
         return "\n".join([*lines, f"outside environment steps and network mathematics: {rest / total:.1%} of the wall time"])
 
 
+# ----------------------------------------------------------------------- the experiments (6.2, 6.3; S6.2-05, 06, S6.3-01 ... 03)
+
+EXPERIMENTS = {  # variant -> what its runs alone have on the command line
+    "methods": {method: ["--method", method] for method in METHODS},
+    "ablation": {"rbexplore": [], "no-merge": ["--no-merge"], "no-prefix": ["--no-prefix"]},
+    "theta-merge": {f"theta-merge-{theta}": ["--theta-merge", theta] for theta in ("0.25", "0.5", "0.75")}}
+
+
+def runs_of(args: argparse.Namespace) -> dict[tuple[str, int], list[str]]:
+    """(variant, seed) -> the command line of that run: what `args` says, the variant's own, the seed; its folder is last."""
+    shared, env, first = ["--no-figures"], args.env or "maze", args.seed or 0
+    for name, value in vars(args).items():
+        if value is not None and name not in ("experiment", "seeds", "seed", "out", "trace", "profile", "no_figures"):
+            flag = name.replace("_", "-")
+            shared += [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+    out = args.out or f"runs/{args.experiment}-{env}"
+    return {(variant, seed): [*shared, *own, "--seed", str(seed), "--out", f"{out}/{variant}-{seed}"]
+            for seed in range(first, first + (args.seeds or 3)) for variant, own in EXPERIMENTS[args.experiment].items()
+            if variant != "oracle" or env == "maze"}
+
+
+def execute(command: list[str]) -> str:
+    """Run it in a process of its own, or go on where it was interrupted, or find it finished. Returns what was done."""
+    folder, settings = pathlib.Path(command[-1]), settings_of(parser().parse_args(command))
+    if (folder / "checkpoint.pt").exists():
+        if json.loads((folder / "config.json").read_text()) | {"versions": 0} != settings | {"versions": 0}:
+            raise InputError(f"{folder} holds a run of another configuration: choose another --out")
+        with open(folder / "metrics.csv") as file:
+            if max((int(row["steps"]) for row in csv.DictReader(file)), default=0) >= settings["config"]["steps"]:
+                return f"{folder} was finished"
+        command = ["--resume", str(folder), "--no-figures"]
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / "log.txt", "a") as log:
+        code = subprocess.run([sys.executable, __file__, *command], stdout=log, stderr=log).returncode
+    if code:
+        raise InputError(f"{folder} ended with code {code}: log.txt there says why; the same command goes on with the rest")
+    return f"{folder} done"
+
+
+def experiment(args: argparse.Namespace) -> int:
+    """All runs, side by side where there are cores; then curves.csv with all curves, the figures, and a line for each run."""
+    runs = runs_of(args)
+    settings = [settings_of(parser().parse_args(command)) for command in runs.values()][0]  # all: an error shows before any run
+    with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // (args.workers or 1))) as pool:
+        try:
+            for line in pool.map(execute, runs.values()):
+                print(line, flush=True)
+        except BaseException:  # Ctrl-C too, which the running processes hear by themselves
+            pool.shutdown(cancel_futures=True)
+            raise
+    out = pathlib.Path(next(iter(runs.values()))[-1]).parent
+    env, grid = make_env(settings["env"], **settings["options"]), np.linspace(0, settings["config"]["steps"], 201).astype(int)
+    full, found, curves = env.full_coverage, {}, {}
+    for (variant, seed), command in runs.items():
+        state = torch.load(pathlib.Path(command[-1]) / "checkpoint.pt", map_location="cpu", weights_only=True)["algorithm"]
+        found[variant, seed] = {tuple(unit): step for unit, step in state["discovered"]}
+        times = sorted(found[variant, seed].values())
+        curves.setdefault(variant, {})[seed] = np.searchsorted(times, grid, "right") * (100 / full if full else 1)
+        needed = [math.ceil(p * (full or 0) / 100) for p in (50, 90, 100)]
+        marks = ", ".join(f"{times[k - 1]:,}" if len(times) >= k else "-" for k in needed)
+        unit = f"%; steps to 50, 90, 100 %: {marks}" if full else "units"
+        print(f"{variant:18} seed {seed}: {curves[variant][seed][-1]:6.1f} {unit}")
+    rows = [f"{v},{n},{x},{y:.4f}" for v, of in curves.items() for n, ys in of.items() for x, y in zip(grid, ys, strict=True)]
+    write_atomically(out / "curves.csv", lambda f: f.write("\n".join(["variant,seed,steps,coverage", *rows, ""]).encode()))
+    if not args.no_figures:
+        figures = {"curves.png": band_figure(grid, curves, full)}
+        if args.experiment == "methods":
+            figures["maps.png"] = maps_figure(env, {v: found[v, best(of)] for v, of in curves.items()}, int(grid[-1]))
+        for name, figure in figures.items():
+            write_atomically(out / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+    print(f"{out}: curves.csv{'' if args.no_figures else ', ' + ', '.join(figures)}")
+    return 0
+
+
+def best(curves: dict[int, np.ndarray]) -> int:
+    """The seed whose coverage is highest at the end (S6.2-06)."""
+    return max(curves, key=lambda seed: curves[seed][-1])
+
+
+def band_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], full: int | None):
+    """Coverage against agent steps: for each variant the mean of its runs, and a band from their least to their most."""
+    figure = new_figure(7, 4)
+    axes = figure.subplots()
+    for variant, of in curves.items():
+        runs = np.stack(list(of.values()))  # (runs, 201)
+        (line,) = axes.plot(grid, runs.mean(0), label=variant)
+        axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
+    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, grid[-1]), ylim=(0, 102 if full else None),
+             ylabel=f"coverage, % of {full} units" if full else "units covered")
+    axes.legend()
+    return figure
+
+
+def maps_figure(env, found: dict[str, dict[tuple, int]], steps: int):
+    """The coverage maps of several runs side by side."""
+    drawn = env.level_map() if hasattr(env, "level_map") else None
+    level, boxes = drawn or rooms_map(set().union(*found.values()))[:2]
+    across = min(3, len(found))
+    figure = new_figure(5 * across, 5.6 * level.shape[0] / level.shape[1] * math.ceil(len(found) / across))
+    panels = figure.subplots(math.ceil(len(found) / across), across, squeeze=False).ravel()
+    for axes, (variant, discovered) in zip(panels, found.items(), strict=False):
+        image = draw_map(axes, level, boxes, discovered, steps)
+        axes.set(title=f"{variant}: {len(discovered)} units", xticks=[], yticks=[])
+    figure.colorbar(image, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
+    return figure
+
+
 # ----------------------------------------------------------------------------------------------------- the command line
 
 
@@ -1205,6 +1673,11 @@ def parser() -> Parser:
     p = Parser(prog="rbexplore.py", allow_abbrev=False, description="Explore an environment by rolling back to stored "
                "states, clustered by a learned similarity: RbExplore (Ugadiarov, Skrynnik, Panov).")
     p.add_argument("--env", help="environment: maze, pop or montezuma (default: maze)")
+    p.add_argument("--method", choices=METHODS, help="what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
+                   "actions; RbExplore with Go-Explore's cells in R's place, or exact states (default: rbexplore)")
+    p.add_argument("--experiment", choices=list(EXPERIMENTS), help="do all runs of figure 4 or 5 (6.2, 6.3) and draw it; --out "
+                   "is then the folder of their run folders; the same command goes on where it was interrupted")
+    p.add_argument("--seeds", type=int, help="with --experiment: runs of each variant, from --seed on (default: 3)")
     p.add_argument("--level", type=int, help="level: 1 to 3 of the maze, 1 to 14 of pop (default: 1)")
     p.add_argument("--rom", help="pop: the NES cartridge's file, which you bring")
     p.add_argument("--state", help="pop: a start state, gzip of the emulator's; without it the cartridge boots")
@@ -1220,26 +1693,30 @@ def parser() -> Parser:
     p.add_argument("--trace", action="store_true", help="write every decision to trace.jsonl")
     p.add_argument("--no-figures", action="store_true", help="draw none")
     p.add_argument("--profile", action="store_true", help="print where the time went")
-    group = p.add_argument_group("fields of the configuration", "In brackets: paper | maze; then the section or reading.")
-    for f in fields(Config):
-        flag, values = "--" + f.name.replace("_", "-"), [getattr(c, f.name) for c in CONFIGS.values()]
-        text = f"[{' | '.join(map(str, dict.fromkeys(values)))}] {f.metadata['meaning']}"
-        kind = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type, "metavar": f.type.__name__}
-        group.add_argument(flag, default=None, help=text.replace("%", "%%"), **kind)
+    for kind, configs, title in ((Config, CONFIGS, "fields of the configuration"), (PPOConfig, PPO_CONFIGS, "of PPO")):
+        group = p.add_argument_group(title, "In brackets: paper | maze; then the section, the reading or the source.")
+        for f in fields(kind):
+            flag, values = "--" + f.name.replace("_", "-"), [getattr(c, f.name) for c in configs.values()]
+            text = f"[{' | '.join(map(str, dict.fromkeys(values)))}] {f.metadata['meaning']}"
+            form = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type, "metavar": f.type.__name__}
+            group.add_argument(flag, default=None, help=text.replace("%", "%%"), **form)
     return p
 
 
 def settings_of(args: argparse.Namespace) -> dict:
     """What makes the run, from the command line: all of it goes to config.json."""
-    given = {f.name: getattr(args, f.name) for f in fields(Config) if getattr(args, f.name) is not None}
-    env = args.env or "maze"
-    config = replace(CONFIGS[args.config or ("maze" if env == "maze" else "paper")], **given)
+    env, method = args.env or "maze", args.method or "rbexplore"
+    base = args.config or ("maze" if env == "maze" else "paper")
+    given, ppo = ({f.name: getattr(args, f.name) for f in fields(kind) if getattr(args, f.name) is not None}
+                  for kind in (Config, PPOConfig))
+    config = config_of(method, CONFIGS[base], **given)
     options = {name: getattr(args, name) for name in ("level", "rom", "state") if getattr(args, name) is not None}
     for name in ("threads", "workers"):
-        if (getattr(args, name) or 1) < 1:
+        if getattr(args, name) is not None and getattr(args, name) < 1:
             raise InputError(f"{name} is {getattr(args, name)}: give 1 or more")
-    return {"method": "rbexplore", "env": env, "options": options | {"frame_size": config.frame_size},
-            "config": asdict(config), "device": args.device or "cpu", "threads": args.threads or 1,
+    return {"method": method, "ppo": asdict(replace(PPO_CONFIGS[base], **ppo)), "env": env,
+            "options": options | {"frame_size": config.frame_size}, "config": asdict(config), "device": args.device or "cpu",
+            "threads": args.threads or 1,
             "workers": args.workers or 1, "versions": {"python": platform.python_version(), "torch": str(torch.__version__),
                                                        "numpy": np.__version__, "gymnasium": gymnasium.__version__}}
 
@@ -1249,12 +1726,15 @@ def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
     path = pathlib.Path(folder) / "config.json"
     try:
         settings = json.loads(path.read_text())
-        values = settings["config"] | settings["options"] | settings
+        fixed = {"level": 1, "rom": None, "state": None, "out": folder} | settings["options"] | settings["config"]
+        fixed |= settings["ppo"] | {name: settings[name] for name in ("method", "env", "device", "threads", "workers")}
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} cannot be read: there is no run in {folder}; see what --out was") from None
+    if args.config:
+        raise InputError("--config goes with a new run: a resumed run keeps its options; leave it out")
     for name, value in vars(args).items():
-        if name in values and name != "config" and value is not None and value != values[name]:
-            raise InputError(f"--{name.replace('_', '-')} {value} differs from {values[name]} in {path}: a resumed run keeps "
+        if name in fixed and value is not None and value != fixed[name]:
+            raise InputError(f"--{name.replace('_', '-')} {value} differs from {fixed[name]} in {path}: a resumed run keeps "
                              "its options; leave it out, or begin anew with another --out")
     return settings
 
@@ -1270,7 +1750,7 @@ def prepare(settings: dict):
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(f"device {settings['device']} cannot be used ({reason}): give another --device, such as cpu") from None
     try:
-        config = Config(**settings["config"])
+        config, ppo = Config(**settings["config"]), PPOConfig(**settings["ppo"])
     except TypeError as error:
         raise InputError(f"the configuration in config.json does not fit this version: {error}") from None
     executor = None
@@ -1278,7 +1758,7 @@ def prepare(settings: dict):
         executor = ProcessPoolExecutor(settings["workers"], multiprocessing.get_context("spawn"), signal.signal,
                                        (signal.SIGINT, signal.SIG_IGN))
     env_fn = functools.partial(make_env, settings["env"], **settings["options"])
-    return RbExplore(env_fn, config, settings["device"], executor), executor
+    return make_method(settings["method"], env_fn, config, settings["device"], executor, ppo), executor
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -1293,6 +1773,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def command(args: argparse.Namespace) -> int:
+    if args.experiment:
+        return experiment(args)
     old = args.resume or args.verify
     settings = recorded_settings(old, args) if old else settings_of(args)
     if args.export_demos and not args.verify:
@@ -1326,6 +1808,8 @@ def command(args: argparse.Namespace) -> int:
 
 
 def verified(run: Run, demos: str | None) -> int:
+    if isinstance(run.algorithm, Baseline):
+        raise InputError(f"{run.folder} is a run of {run.settings['method']}, which has no clusters to verify")
     run.load()
     table, good = verify(run.algorithm)
     print(table)
@@ -1341,8 +1825,8 @@ def header(run: Run) -> str:
     level = f", level {s['options'].get('level', 1)}" if s["env"] != "montezuma" else ""
     units = f"{full} units to cover" if full else "full coverage is not known"
     begin = f", from step {a.steps:,} on" if a.steps else ""
-    return (f"RbExplore on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} of them "
-            f"pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
+    return (f"{s['method']} on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} "
+            f"of them pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
             f"torch {s['versions']['torch']}; run folder {run.folder}\n{Run.COLUMNS}")
 
 
@@ -1350,7 +1834,9 @@ def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
     a, full = run.algorithm, getattr(run.algorithm.env, "full_coverage", None)
     times = sorted(a.discovered.values())
     lines = [f"{'stopped' if stopped else 'done'} after {a.steps:,} steps and {seconds:.0f} s: {len(times)} "
-             f"{f'of {full} units ({100 * len(times) / full:.1f} %)' if full else 'units'}, {len(a.graph.clusters)} clusters"]
+             f"{f'of {full} units ({100 * len(times) / full:.1f} %)' if full else 'units'}"]
+    if not isinstance(a, Baseline):
+        lines[0] += f", {len(a.graph.clusters)} clusters"
     if full:
         marks = [(share, math.ceil(full * share / 100)) for share in (50, 90, 100)]
         lines.append("steps to " + ", ".join(f"{share} %: {times[k - 1]:,}" if len(times) >= k else f"{share} %: not reached"
