@@ -131,7 +131,7 @@ class Config:
 
 
 # The maze's: what a small image, a small budget and a CPU need; the rest is the paper's.
-MAZE = Config(steps=100_000, pretrain_steps=8_000, M=20, trajectory_steps=150, L=20, frame_size=32,
+MAZE = Config(steps=100_000, pretrain_steps=8_000, trajectory_steps=150, L=30, frame_size=32,
               encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_batch=128,
               rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3)
 CONFIGS = {"paper": Config(), "maze": MAZE}
