@@ -1670,8 +1670,9 @@ class Parser(argparse.ArgumentParser):
 
 
 def parser() -> Parser:
-    p = Parser(prog="rbexplore.py", allow_abbrev=False, description="Explore an environment by rolling back to stored "
-               "states, clustered by a learned similarity: RbExplore (Ugadiarov, Skrynnik, Panov).")
+    p = Parser(prog="rbexplore.py", usage="rbexplore.py --env maze [options]", allow_abbrev=False,
+               description="Explore an environment by rolling back to stored states, clustered by a learned similarity: "
+                           "RbExplore (Ugadiarov, Skrynnik, Panov).")
     p.add_argument("--env", help="environment: maze, pop or montezuma (default: maze)")
     p.add_argument("--method", choices=METHODS, help="what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
                    "actions; RbExplore with Go-Explore's cells in R's place, or exact states (default: rbexplore)")

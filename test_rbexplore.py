@@ -5,15 +5,18 @@ obvious versions stand beside the fast ones. `pytest -m mutants` breaks the code
 
 import csv
 import functools
+import gc
 import gzip
 import io
 import itertools
+import json
 import math
 import multiprocessing
 import os
 import pathlib
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -1798,6 +1801,77 @@ def test_gymnasium_accepts_the_cartridge(prince):
 
 def test_gymnasium_accepts_montezuma(montezuma):
     check_env(montezuma, skip_render_check=True)
+
+
+def test_the_trace_alone_rebuilds_the_graph(finished):
+    """Visits, arcs and parents, from nothing but the decisions that trace.jsonl tells."""
+    visits, arcs, parents = Counter({0: 1}), Counter(), {0: None}
+    for event in map(json.loads, (finished / "trace.jsonl").read_text().splitlines()):
+        if event["event"] == "restart":
+            visits, arcs, parents = Counter({0: 1}), Counter(), {0: None}
+        elif event["event"] == "assign":
+            assert event["clusters"][0] == event["start"] and len(event["R"]) == len(event["clusters"])
+            visits.update(event["clusters"])
+            arcs.update((a, b) for a, b in itertools.pairwise(event["clusters"]) if a != b)
+            parents |= dict(event["made"])
+        elif event["event"] == "merge":
+            for survivor, gone, score in event["merged"]:
+                assert survivor < gone and score > 0.5
+                visits[survivor] += visits.pop(gone)
+                moved = Counter()
+                for arc, crossings in arcs.items():
+                    moved[tuple(survivor if v == gone else v for v in arc)] += crossings
+                arcs = Counter({arc: crossings for arc, crossings in moved.items() if arc[0] != arc[1]})
+                del parents[gone]
+                parents = {v: survivor if parent == gone else parent for v, parent in parents.items()}
+    state = torch.load(finished / "checkpoint.pt", weights_only=True)["algorithm"]
+    assert {v: (parent, n) for v, _, _, parent, n in state["clusters"]} == {v: (parents[v], visits[v]) for v in parents}
+    assert {(a, b): n for a, b, n in state["arcs"]} == dict(arcs)
+
+
+def test_verify_replays_and_restores_every_centre_and_exports_the_actions(finished, tmp_path, capsys):
+    clusters = len(torch.load(finished / "checkpoint.pt", weights_only=True)["algorithm"]["clusters"])
+    before = {path: path.read_bytes() for path in finished.iterdir()}
+    assert main(["--verify", str(finished), "--export-demos", str(tmp_path / "demos.npz")]) == 0
+    assert f"{clusters} of {clusters} clusters are reached exactly" in capsys.readouterr().out
+    assert before == {path: path.read_bytes() for path in finished.iterdir()}
+    demos = np.load(tmp_path / "demos.npz")
+    assert len(demos["clusters"]) == clusters > 3
+    for k, centre in enumerate(demos["centres"]):
+        env = Maze()
+        frame, _ = env.reset()
+        for action in demos["actions"][demos["offsets"][k] : demos["offsets"][k + 1]]:
+            frame = env.step(int(action))[0]
+        assert np.array_equal(frame, centre)
+
+
+@pytest.mark.parametrize("what", ["centre", "snapshot", "actions"])
+def test_verify_finds_a_cluster_that_is_not_reached(finished, tmp_path, capsys, what):
+    wrong = shutil.copytree(finished, tmp_path / "wrong")
+    state = torch.load(wrong / "checkpoint.pt", weights_only=True)
+    clusters, paths = state["algorithm"]["clusters"], state["algorithm"]["paths"]
+    last = clusters[-1]
+    if what == "centre":
+        paths[last[2]][1][-1, 0, 0] += 1
+    elif what == "snapshot":
+        clusters[-1] = (last[0], clusters[0][1], *last[2:])
+    else:
+        paths[last[2]][2].append("01" * 5)  # five times to the left
+    torch.save(state, wrong / "checkpoint.pt")
+    assert main(["--verify", str(wrong)]) == 1
+    assert f"{len(clusters) - 1} of {len(clusters)} clusters" in capsys.readouterr().out
+
+
+def test_verify_in_the_emulators(rom, tmp_path, capsys):
+    pytest.importorskip("ale_py", reason="Montezuma's emulator, ale-py, is not installed")
+    small = ["--config", "maze", "--frame-size", "48", "--steps", "900", "--pretrain-steps", "200", "--M", "4", "--L", "4",
+             "--epochs", "1", "--no-figures"]
+    for env, options in (("pop", ["--rom", rom]), ("montezuma", [])):
+        folder = str(tmp_path / env)
+        assert main(["--env", env, *options, *small, "--out", folder]) == 0
+        gc.collect()  # stable-retro allows one emulator in a process: the run's must be gone
+        assert main(["--verify", folder]) == 0 and "DIFFERS" not in capsys.readouterr().out
+        gc.collect()
 
 
 # ------------------------------------------------------------------------------------------ the methods compared (6.2, 6.3)
