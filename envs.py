@@ -31,6 +31,7 @@ class PersistentEnv(gymnasium.Env):
     """
 
     full_coverage: int | None = None  # number of units of full coverage (paper 5), None where it is not known
+    unit_name = "units"  # what a unit is, printed beside every coverage (reading R26)
 
     def snapshot(self) -> bytes:
         """The complete state (position, clocks, generators, everything hidden) in as few bytes as possible."""
@@ -57,15 +58,23 @@ class PersistentEnv(gymnasium.Env):
 
 
 def check_contract(env) -> None:
-    """Raise InputError, saying what is missing, unless `env` is a persistent environment as PersistentEnv describes it."""
-    missing = [name for name in ("reset", "step", "snapshot", "restore", "unit") if not callable(getattr(env, name, None))]
+    """Raise InputError, saying what is wrong, unless `env` is a persistent environment as PersistentEnv describes it."""
+    names = ("reset", "step", "snapshot", "restore", "unit", "close")
+    missing = [name for name in names if not callable(getattr(env, name, None))]
     if missing:
-        raise InputError(f"the environment lacks {', '.join(missing)}(): see PersistentEnv in envs.py")
-    actions, frames = env.action_space, env.observation_space
+        raise InputError(f"the environment lacks {', '.join(missing)}(): see PersistentEnv in envs.py; of a wrapped "
+                         "environment give env.unwrapped")
+    actions, frames = getattr(env, "action_space", None), getattr(env, "observation_space", None)
     if not isinstance(actions, gymnasium.spaces.Discrete) or actions.n > 256:
         raise InputError(f"the action space is {actions}: it must be Discrete with at most 256 actions")
     if not isinstance(frames, gymnasium.spaces.Box) or frames.dtype != np.uint8 or len(frames.shape) not in (2, 3):
         raise InputError(f"the observation space is {frames}: it must be a Box of uint8, (H, W) or (H, W, C)")
+    frame = np.array(env.reset()[0])
+    if frame.shape != frames.shape or frame.dtype != np.uint8:
+        raise InputError(f"reset() gives a frame {frame.shape} of {frame.dtype}: it must be as the observation space says")
+    snapshot = env.snapshot()
+    if not isinstance(snapshot, bytes) or not np.array_equal(env.restore(snapshot), frame):
+        raise InputError("snapshot() must give bytes, and restore() of them the same frame again: see PersistentEnv in envs.py")
 
 
 # ---- The maze: a side-view level in the spirit of the Prince of Persia (paper 5) ---------------------------------
@@ -143,6 +152,7 @@ class Maze(PersistentEnv):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    unit_name = "tiles"
 
     def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
         if level not in tuple(LEVELS):  # a tuple, since a list cannot be looked up in a dict
@@ -485,6 +495,7 @@ class PrinceOfPersia(EmulatorEnv):
     # Units in the full coverage sets of levels 1 to 14, counted from the authors' reference data (R26).
     FULL_COVERAGE = (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
     LIVES = "hit_points"
+    unit_name = "units of 32 x 32 pixels"
 
     def __init__(self, rom: str | None = None, level: int = 1, state: str | None = None, frame_size: int = 96):
         if level not in range(1, 15):
@@ -553,6 +564,8 @@ class Montezuma(EmulatorEnv):
     chain of rollbacks would reach. ALE's minimal set of actions: here all 18. No full coverage set is known.
     info: room, x, y (ALE pixels) and lives, and "blank".
     """
+
+    unit_name = "units of 16 x 16 pixels"
 
     def __init__(self, frame_size: int = 96):
         try:

@@ -46,6 +46,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, fields, replace
 
 import gymnasium
@@ -55,6 +56,11 @@ from torch import nn
 from torch.nn import functional as F
 
 from envs import InputError, Maze, check_contract, make_env
+
+try:
+    import resource
+except ImportError:  # Windows has none
+    resource = None
 
 # ---------------------------------------------------------------------------- configuration (6.1; S6.1-05, 08, 09, 12)
 
@@ -84,7 +90,7 @@ class Config:
     """The paper's configuration: the defaults are its values, the same for every level. A step is an agent step:
     one action, after the frameskip (R1). Raises InputError for a value that cannot work."""
 
-    seed: int = option(0, "every generator is made from it", 0)
+    seed: int = option(0, "every generator is made from it", 0, 2**63)
     steps: int = option(15_000_000, "agent steps in all: exploration, additional, pretraining (6.2, R2)", 1)
     pretrain_steps: int = option(500_000, "steps of pretraining; then G is reset (6.1)", 0)
     M: int = option(30, "exploration trajectories an iteration (6.1)", 1)
@@ -103,7 +109,7 @@ class Config:
     theta_sim: float = option(0.5, "a state joins a cluster above this R (6.1)", 0, 1)
     theta_merge: float = option(0.5, "two clusters merge above this R (6.1)", 0, 1)
     merge: bool = option(True, "merge clusters (4.2; off: the ablation of 6.3)")
-    merge_every: int = option(15, "iterations from one merge to the next (6.1)", 1)
+    merge_every: int = option(15, "iterations from one merge to the next, those of pretraining counted (6.1, R28)", 1)
     max_clusters: int = option(0, "make no cluster beyond so many; 0: no bound, as in the paper", 0)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32)
     encoder: str = option("resnet18", "network that embeds a frame for R (6.1)", choices=("resnet18", "small"))
@@ -466,7 +472,8 @@ def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module
         height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
         channels = planes
     if min(height, width) < 1:
-        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: set rnd_encoder to small")
+        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: make them larger, or set encoder and "
+                         "rnd_encoder to small")
     return nn.Sequential(*modules, nn.Flatten(), nn.Linear(channels * height * width, out))
 
 
@@ -526,13 +533,15 @@ class SimilarityModel(nn.Module):
     def fit(self, pairs: Pairs, config: Config, rng: np.random.Generator, tell: Callable) -> float | None:
         """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs."""
         self.train()
-        for epoch in range(config.epochs):
-            order, losses = pairs.balanced(rng), []
-            batches = np.array_split(order, math.ceil(len(order) / config.r_batch) or 1)
-            for k, batch in enumerate(batches if len(order) else []):
-                losses.append(self.update(*pairs.frames(batch), pairs.y[batch], config.r_clip))
-                tell("progress", step="train R", done=epoch * len(batches) + k + 1, total=config.epochs * len(batches))
-        self.eval()
+        try:
+            for epoch in range(config.epochs):
+                order, losses = pairs.balanced(rng), []
+                batches = np.array_split(order, math.ceil(len(order) / config.r_batch) or 1)
+                for k, batch in enumerate(batches if len(order) else []):
+                    losses.append(self.update(*pairs.frames(batch), pairs.y[batch], config.r_clip))
+                    tell("progress", step="train R", done=epoch * len(batches) + k + 1, total=config.epochs * len(batches))
+        finally:
+            self.eval()
         return float(np.mean(losses)) if losses else None
 
     def update(self, first: np.ndarray, second: np.ndarray, y: np.ndarray, clip: float) -> float:
@@ -1240,23 +1249,24 @@ class Run:
             raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
             write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
         except OSError as error:
             raise InputError(f"{self.folder} cannot be written: {error.strerror}; choose another folder with --out") from None
-        self.save()
 
     def load(self) -> None:
         """Take the state of the last complete iteration from the checkpoint; writes nothing."""
         path = self.folder / "checkpoint.pt"
         try:
-            state = torch.load(path, map_location=self.settings["device"], weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)  # load_state_dict moves what must move
             self.rows, settings, self.trace_bytes = state["rows"], state["settings"], state["trace_bytes"]
-            if settings == self.settings:
+            same = all(settings[key] == self.settings[key] for key in ("method", "ppo", "env", "options", "config", "threads"))
+            if same:
                 unpack(self.algorithm, state["algorithm"])
         except Exception as error:  # torch raises many kinds for a file that is cut short
             raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
                              "another --out") from None
-        if settings != self.settings:
+        if not same:
             raise InputError(f"{path} is of another configuration than config.json beside it: put the right one back, or "
                              "begin anew with another --out")
 
@@ -1274,10 +1284,10 @@ class Run:
             with open(self.folder / "trace.jsonl", "ab") as file:
                 file.writelines(json.dumps(event).encode() + b"\n" for event in self.events)
                 self.trace_bytes, self.events = file.tell(), []
-        self.write_metrics()
         state = {"settings": self.settings, "rows": self.rows, "trace_bytes": self.trace_bytes,
                  "algorithm": pack(self.algorithm)}
         write_atomically(self.folder / "checkpoint.pt", lambda f: torch.save(state, f))
+        self.write_metrics()  # last: resuming writes it anew from the checkpoint
 
     def write_metrics(self) -> None:
         lines = [",".join("" if row.get(name) is None else str(row[name]) for name in METRICS) for row in self.rows]
@@ -1350,7 +1360,7 @@ def draw_figures(run: Run) -> list[str]:
     a.env.restore(a.snap_init)
     drawn = a.env.level_map() if hasattr(a.env, "level_map") else None
     level, boxes, labels = (*drawn, []) if drawn else rooms_map({*a.discovered, *unit_of.values()})
-    figures = {"coverage.png": coverage_figure([(run.settings["method"], [a])])}
+    figures = {"coverage.png": coverage_figure(a, run.settings["method"])}
     if graph:
         figures["centres.png"] = centres_figure(a)
     if boxes:
@@ -1383,21 +1393,22 @@ def coverage_curve(a) -> tuple[np.ndarray, np.ndarray]:
     return steps, np.array([0, *range(1, len(a.discovered) + 1), len(a.discovered)])
 
 
-def coverage_figure(curves: list) -> object:
-    """Coverage against agent steps: for each (name, runs) the mean, and the min-max band where there are several."""
-    figure = new_figure(7, 4)
+def coverage_figure(a, name: str):
+    """Coverage against agent steps."""
+    figure, full = new_figure(7, 4), getattr(a.env, "full_coverage", None)
     axes = figure.subplots()
-    full = getattr(curves[0][1][0].env, "full_coverage", None)
-    for name, runs in curves:
-        steps, units = coverage_curve(runs[0])
-        axes.step(steps, units * (100 / full if full else 1), where="post", label=name)
-    pretrain = curves[0][1][0].config.pretrain_steps
-    if pretrain:
-        axes.axvspan(0, pretrain, color="0.9", label="pretraining")
+    steps, units = coverage_curve(a)
+    axes.step(steps, units * (100 / full if full else 1), where="post", label=name)
+    if a.config.pretrain_steps:
+        axes.axvspan(0, a.config.pretrain_steps, color="0.9", label="pretraining")
     axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, None), ylim=(0, 102 if full else None),
-             ylabel=f"coverage, % of {full} units" if full else "units covered")
+             ylabel=f"coverage, % of {full} {unit_name(a.env)}" if full else f"{unit_name(a.env)} covered")
     axes.legend(loc="lower right")
     return figure
+
+
+def unit_name(env) -> str:
+    return getattr(env, "unit_name", "units")
 
 
 def map_axes(level: np.ndarray, labels: list, title: str):
@@ -1413,8 +1424,8 @@ def map_axes(level: np.ndarray, labels: list, title: str):
 def map_figure(a, level: np.ndarray, boxes: dict, labels: list) -> object:
     """The level, its visited units coloured by the step of the first visit, the others crossed out."""
     full = getattr(a.env, "full_coverage", None)
-    share = f"{100 * len(a.discovered) / full:.1f} % of {full} units" if full else f"{len(a.discovered)} units"
-    figure, axes = map_axes(level, labels, f"coverage after {a.steps:,} steps: {share}")
+    share = f"{100 * len(a.discovered) / full:.1f} % of {full}" if full else f"{len(a.discovered)}"
+    figure, axes = map_axes(level, labels, f"coverage after {a.steps:,} steps: {share} {unit_name(a.env)}")
     figure.colorbar(draw_map(axes, level, boxes, a.discovered, a.steps), label="step of the first visit", shrink=0.8)
     return figure
 
@@ -1513,8 +1524,8 @@ class Profile:
     def __init__(self, algorithm: RbExplore, run: Run):
         self.seconds, self.step, self.depth = Counter(), "run folder, start", 0
         a = algorithm
-        if isinstance(a, Baseline) or isinstance(a.similarity, Cells):
-            raise InputError("--profile is for --method rbexplore")
+        if isinstance(a, Baseline) or isinstance(a.similarity, Cells) or a.executor:
+            raise InputError("--profile is for --method rbexplore with one worker")
         for name in self.STEPS:
             self.wrap(a, name, None)
         for name in ("step", "snapshot", "restore", "unit"):
@@ -1578,7 +1589,7 @@ def runs_of(args: argparse.Namespace) -> dict[tuple[str, int], list[str]]:
 def execute(command: list[str]) -> str:
     """Run it in a process of its own, or go on where it was interrupted, or find it finished. Returns what was done."""
     folder, settings = pathlib.Path(command[-1]), settings_of(parser().parse_args(command))
-    if (folder / "checkpoint.pt").exists():
+    if (folder / "config.json").exists():
         if json.loads((folder / "config.json").read_text()) | {"versions": 0} != settings | {"versions": 0}:
             raise InputError(f"{folder} holds a run of another configuration: choose another --out")
         with open(folder / "metrics.csv") as file:
@@ -1595,6 +1606,8 @@ def execute(command: list[str]) -> str:
 
 def experiment(args: argparse.Namespace) -> int:
     """All runs, side by side where there are cores; then curves.csv with all curves, the figures, and a line for each run."""
+    if args.seeds is not None and args.seeds < 1:
+        raise InputError(f"seeds is {args.seeds}: give 1 or more")
     runs = runs_of(args)
     settings = [settings_of(parser().parse_args(command)) for command in runs.values()][0]  # all: an error shows before any run
     with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // (args.workers or 1))) as pool:
@@ -1676,8 +1689,8 @@ def parser() -> Parser:
     p.add_argument("--env", help="environment: maze, pop or montezuma (default: maze)")
     p.add_argument("--method", choices=METHODS, help="what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
                    "actions; RbExplore with Go-Explore's cells in R's place, or exact states (default: rbexplore)")
-    p.add_argument("--experiment", choices=list(EXPERIMENTS), help="do all runs of figure 4 or 5 (6.2, 6.3) and draw it; --out "
-                   "is then the folder of their run folders; the same command goes on where it was interrupted")
+    p.add_argument("--experiment", choices=list(EXPERIMENTS), help="do all runs of figures 4 and 5 (6.2) or of figure 6 (6.3), "
+                   "and draw; --out is then the folder of their folders; the same command goes on where it was interrupted")
     p.add_argument("--seeds", type=int, help="with --experiment: runs of each variant, from --seed on (default: 3)")
     p.add_argument("--level", type=int, help="level: 1 to 3 of the maze, 1 to 14 of pop (default: 1)")
     p.add_argument("--rom", help="pop: the NES cartridge's file, which you bring")
@@ -1711,15 +1724,19 @@ def settings_of(args: argparse.Namespace) -> dict:
     given, ppo = ({f.name: getattr(args, f.name) for f in fields(kind) if getattr(args, f.name) is not None}
                   for kind in (Config, PPOConfig))
     config = config_of(method, CONFIGS[base], **given)
-    options = {name: getattr(args, name) for name in ("level", "rom", "state") if getattr(args, name) is not None}
+    paths = {name: getattr(args, name) and os.path.abspath(getattr(args, name)) for name in ("rom", "state")}
+    options = {name: value for name, value in ({"level": args.level} | paths).items() if value is not None}
     for name in ("threads", "workers"):
         if getattr(args, name) is not None and getattr(args, name) < 1:
             raise InputError(f"{name} is {getattr(args, name)}: give 1 or more")
     return {"method": method, "ppo": asdict(replace(PPO_CONFIGS[base], **ppo)), "env": env,
             "options": options | {"frame_size": config.frame_size}, "config": asdict(config), "device": args.device or "cpu",
-            "threads": args.threads or 1,
-            "workers": args.workers or 1, "versions": {"python": platform.python_version(), "torch": str(torch.__version__),
-                                                       "numpy": np.__version__, "gymnasium": gymnasium.__version__}}
+            "threads": args.threads or 1, "workers": args.workers or 1, "versions": versions()}
+
+
+def versions() -> dict[str, str]:
+    return {"python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__,
+            "gymnasium": gymnasium.__version__}
 
 
 def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
@@ -1728,12 +1745,19 @@ def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
     try:
         settings = json.loads(path.read_text())
         fixed = {"level": 1, "rom": None, "state": None, "out": folder} | settings["options"] | settings["config"]
-        fixed |= settings["ppo"] | {name: settings[name] for name in ("method", "env", "device", "threads", "workers")}
+        fixed |= settings["ppo"] | {name: settings[name] for name in ("method", "env", "device", "threads")}
+        recorded = settings["workers"], settings["versions"]
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{path} cannot be read: there is no run in {folder}; see what --out was") from None
     if args.config:
         raise InputError("--config goes with a new run: a resumed run keeps its options; leave it out")
+    settings["workers"] = args.workers or recorded[0]  # any number gives the same result
+    if args.verify and args.device:
+        settings["device"] = fixed["device"] = args.device
+    if recorded[1] != versions():
+        print(f"note: {folder} was begun with {recorded[1]}, this is {versions()}: the result may differ in the last digits")
     for name, value in vars(args).items():
+        value = os.path.abspath(value) if name in ("rom", "state") and value else value
         if name in fixed and value is not None and value != fixed[name]:
             raise InputError(f"--{name.replace('_', '-')} {value} differs from {fixed[name]} in {path}: a resumed run keeps "
                              "its options; leave it out, or begin anew with another --out")
@@ -1746,7 +1770,7 @@ def prepare(settings: dict):
     torch.use_deterministic_algorithms(True)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS wants for that
     try:
-        torch.zeros(1, device=settings["device"])
+        torch.zeros(1, device=settings["device"]).cpu()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(f"device {settings['device']} cannot be used ({reason}): give another --device, such as cpu") from None
@@ -1769,17 +1793,22 @@ def main(argv: list[str] | None = None) -> int:
     except (InputError, FloatingPointError) as error:
         print(f"rbexplore: {error}", file=sys.stderr)
         return 2
+    except BrokenProcessPool:
+        print("rbexplore: a worker process died, of memory perhaps: go on with --resume and fewer --workers", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 
 
 def command(args: argparse.Namespace) -> int:
+    if sum(map(bool, (args.experiment, args.resume, args.verify))) > 1:
+        raise InputError("--experiment, --resume and --verify exclude each other: give one of them")
+    if args.export_demos and not args.verify:
+        raise InputError("--export-demos goes with --verify RUN")
     if args.experiment:
         return experiment(args)
     old = args.resume or args.verify
     settings = recorded_settings(old, args) if old else settings_of(args)
-    if args.export_demos and not args.verify:
-        raise InputError("--export-demos goes with --verify RUN")
     if not args.no_figures and not args.verify:
         new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
     started = time.monotonic()
@@ -1824,7 +1853,7 @@ def header(run: Run) -> str:
     s, c, a = run.settings, run.settings["config"], run.algorithm
     full = getattr(a.env, "full_coverage", None)
     level = f", level {s['options'].get('level', 1)}" if s["env"] != "montezuma" else ""
-    units = f"{full} units to cover" if full else "full coverage is not known"
+    units = f"{full} {unit_name(a.env)} to cover" if full else f"full coverage in {unit_name(a.env)} is not known"
     begin = f", from step {a.steps:,} on" if a.steps else ""
     return (f"{s['method']} on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} "
             f"of them pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
@@ -1835,13 +1864,16 @@ def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
     a, full = run.algorithm, getattr(run.algorithm.env, "full_coverage", None)
     times = sorted(a.discovered.values())
     lines = [f"{'stopped' if stopped else 'done'} after {a.steps:,} steps and {seconds:.0f} s: {len(times)} "
-             f"{f'of {full} units ({100 * len(times) / full:.1f} %)' if full else 'units'}"]
+             f"{f'of {full} ' if full else ''}{unit_name(a.env)}{f' ({100 * len(times) / full:.1f} %)' if full else ''}"]
     if not isinstance(a, Baseline):
         lines[0] += f", {len(a.graph.clusters)} clusters"
     if full:
         marks = [(share, math.ceil(full * share / 100)) for share in (50, 90, 100)]
         lines.append("steps to " + ", ".join(f"{share} %: {times[k - 1]:,}" if len(times) >= k else f"{share} %: not reached"
                                              for share, k in marks))
+    if resource:
+        unit = 2**30 if sys.platform == "darwin" else 2**20  # it counts bytes there, elsewhere kilobytes
+        lines[0] += f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.2f} GiB"
     lines.append(f"{run.folder}: config.json, metrics.csv, checkpoint.pt{', ' if figures else ''}{', '.join(figures)}")
     if stopped:
         lines.append(f"go on with: python rbexplore.py --resume {run.folder}")
