@@ -1355,11 +1355,21 @@ def test_ctrl_c_before_the_first_iteration_ends(tmp_path, monkeypatch):
 
 
 def test_workers_change_nothing(finished, tmp_path, capsys):
-    argv = ["--out", str(tmp_path / "two"), "--workers", "2", "--no-figures", "--profile"]
-    assert main([*TINY_RUN, *argv]) == 0
+    assert main([*TINY_RUN, "--out", str(tmp_path / "two"), "--workers", "2", "--no-figures"]) == 0
     assert outcome(tmp_path / "two") == outcome(finished)
     out = capsys.readouterr().out
-    assert "2 worker(s)" in out and "outside environment steps" in out and "\r" not in out
+    assert "2 worker(s)" in out and "\r" not in out
+
+
+def test_the_profile_adds_up_and_changes_nothing(finished, tmp_path, capsys):
+    assert main([*TINY_RUN, "--out", str(tmp_path / "run"), "--no-figures", "--profile"]) == 0
+    assert outcome(tmp_path / "run") == outcome(finished)
+    table = [line.split() for line in capsys.readouterr().out.splitlines()]
+    steps = [list(map(float, row[-5:-1])) for row in table if row and row[-1].endswith("%")][-6:]
+    (whole,) = [list(map(float, row[1:])) for row in table if row and row[0] == "all"]
+    assert np.allclose(np.sum(steps, 0), whole, atol=0.1) and np.allclose([sum(row[:3]) for row in [*steps, whole]],
+                                                                          [row[3] for row in [*steps, whole]], atol=0.05)
+    assert steps[0][0] > 0 and steps[2][1] > steps[2][0] == 0  # step 1 is the environment's time, step 3 the networks'
 
 
 def check_refused(capsys, tmp_path, argv, said):
