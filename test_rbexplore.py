@@ -1871,7 +1871,7 @@ def test_verify_finds_a_cluster_that_is_not_reached(finished, tmp_path, capsys, 
     assert f"{len(clusters) - 1} of {len(clusters)} clusters" in capsys.readouterr().out
 
 
-def test_verify_in_the_emulators(rom, tmp_path, capsys):
+def test_verify_and_workers_in_the_emulators(rom, tmp_path, capsys):
     pytest.importorskip("ale_py", reason="Montezuma's emulator, ale-py, is not installed")
     small = ["--config", "maze", "--frame-size", "48", "--steps", "900", "--pretrain-steps", "200", "--M", "4", "--L", "4",
              "--epochs", "1", "--no-figures"]
@@ -1881,6 +1881,10 @@ def test_verify_in_the_emulators(rom, tmp_path, capsys):
         gc.collect()  # stable-retro allows one emulator in a process: the run's must be gone
         assert main(["--verify", folder]) == 0 and "DIFFERS" not in capsys.readouterr().out
         gc.collect()
+        assert main(["--env", env, *options, *small, "--out", folder + "2", "--workers", "2"]) == 0  # an emulator in each
+        gc.collect()
+        one, two = (torch.load(pathlib.Path(f, "checkpoint.pt"), weights_only=True)["algorithm"] for f in (folder, folder + "2"))
+        assert tensors_as_bytes(one) == tensors_as_bytes(two) and len(one["clusters"]) > 1
 
 
 # ------------------------------------------------------------------------------------------ the methods compared (6.2, 6.3)
