@@ -54,6 +54,7 @@ import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional as F
+from torch.utils.checkpoint import checkpoint_sequential
 
 from envs import InputError, Maze, check_contract, make_env
 
@@ -419,7 +420,7 @@ class Pairs:
 
     def frames(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The states s_1 and the states s_2 of the chosen pairs, (B, H, W) each."""
-        return tuple(np.stack([self.states[s] for s in self.index[chosen, side]]) for side in (0, 1))
+        return tuple(np.array([self.states[s] for s in self.index[chosen, side].tolist()]) for side in (0, 1))
 
 
 # --------------------------------------------------- step 3: the similarity model R (4.1, 6.1; S4.1-08, S6.1-02 ... 04)
@@ -437,14 +438,14 @@ class BasicBlock(nn.Module):
     def __init__(self, inputs: int, width: int, stride: int):
         super().__init__()
         self.residual = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(),
+            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(inplace=True),
             nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
         self.shortcut = nn.Sequential()
         if stride > 1:
             self.shortcut = nn.Sequential(nn.Conv2d(inputs, width, 1, stride, bias=False), nn.BatchNorm2d(width))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return F.relu(self.residual(x) + self.shortcut(x))
+        return F.relu(self.residual(x) + self.shortcut(x), inplace=True)
 
 
 class SpatialMean(nn.Module):
@@ -452,12 +453,22 @@ class SpatialMean(nn.Module):
         return x.mean((2, 3))  # as AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA
 
 
+class Frugal(nn.Sequential):
+    """A Sequential that trains in less memory: it takes a batch in halves, the states s_1 and the states s_2, and has the
+    backward pass compute most activations anew, not kept (which moves BatchNorm's running statistics twice a batch)."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if not self.training:
+            return super().forward(x)
+        return torch.cat([checkpoint_sequential(self, 3, half, use_reentrant=False) for half in x.chunk(2)])
+
+
 def resnet18(channels: int, out: int) -> nn.Module:
     """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
-    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(), nn.MaxPool2d(3, 2, 1)]
+    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
     for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
         layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
-    return nn.Sequential(*layers, SpatialMean(), nn.Linear(512, out))
+    return Frugal(*layers, SpatialMean(), nn.Linear(512, out))
 
 
 SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding

@@ -3,6 +3,7 @@
 Observations are their own ground truth where that is possible, R is a stub where a statement is about logic, and slow
 obvious versions stand beside the fast ones. `pytest -m mutants` breaks the code in many small ways; the tests must notice."""
 
+import copy
 import csv
 import functools
 import gc
@@ -409,6 +410,24 @@ def test_S6_1_03_and_04_resnet18_and_four_fully_connected_layers():
     R = model.score(model.embed(a), model.embed(b))
     assert np.allclose(R, torch.sigmoid(model(a, b)).detach().numpy(), atol=1e-5)
     assert not np.allclose(R, model.score(model.embed(b), model.embed(a)), atol=1e-5), "concatenated: the order matters"
+
+
+def test_S6_1_03_resnet18_trains_in_less_memory_with_the_same_gradients():
+    def run(network):
+        kept = []  # bytes of activations: what has as many rows as the batch
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: (kept.append(x.nbytes * (len(x) == 2)), x)[1], lambda x: x):
+            out = torch.cat([network(half) for half in halves]) if network is plain else network(torch.cat(halves))
+        out.square().sum().backward()
+        return sum(kept), [p.grad for p in network.parameters()]
+
+    frugal = SimilarityModel(Config(), (96, 96)).encoder.train()
+    plain = nn.Sequential(*copy.deepcopy(frugal)).train()
+    halves = rbexplore.to_input(pictures(4, size=96), "cpu").chunk(2)
+    (most, expected), (least, gradients) = run(plain), run(frugal)
+    assert all(torch.allclose(a, b, rtol=1e-3, atol=1e-4) for a, b in zip(gradients, expected, strict=True))
+    assert least < most / 2
+    x = halves[0]
+    assert torch.equal(frugal.eval()(x), nn.Sequential(*frugal)(x)), "nothing differs in evaluation"
 
 
 # -- 4.2: assignment
@@ -2505,6 +2524,14 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      '        if stride > 1:\n',
      '        if False:\n',
      'test_S6_1_03_and_04'),
+    ('S6.1-03', 'the batch is not halved in training',
+     'for half in x.chunk(2)])',
+     'for half in x.chunk(1)])',
+     'test_S6_1_03_resnet18_trains'),
+    ('S6.1-03', 'every activation is kept',
+     'checkpoint_sequential(self, 3, half, use_reentrant=False)',
+     'super(Frugal, self).forward(half)',
+     'test_S6_1_03_resnet18_trains'),
     ('S6.1-04', 'five layers',
      '((2 * d, w), (w, w), (w, w), (w, 1))',
      '((2 * d, w), (w, w), (w, w), (w, w), (w, 1))',
