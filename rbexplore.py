@@ -194,11 +194,15 @@ class RbExplore:
         self.update_graph(trajectories)
         self.train_novelty(trajectories)
 
-        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
-        self.row |= {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
-                     "coverage": units / full if full else None, "clusters": len(self.graph.clusters)}
+        self.row |= self.counts() | {"clusters": len(self.graph.clusters)}
         self.tell("row", row=self.row)
         return self.row
+
+    def counts(self) -> dict:
+        """Steps so far, and %Cov: units visited, of those of full coverage where these are known (5; S5-03)."""
+        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
+        return {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
+                "coverage": units / full if full else None}
 
     def restart(self) -> None:
         """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
@@ -830,7 +834,7 @@ class Baseline:
     """What the compared methods share with RbExplore: one step counter, one coverage (R2, R25), seeds by purpose, and the
     interface that the run folder uses. A subclass has advance(): spend the steps of one iteration, and learn from them."""
 
-    run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
+    run, seed, rng, counts, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, RbExplore.counts, "explore"
 
     def __init__(self, env_fn: Callable, config: Config):
         self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
@@ -846,9 +850,7 @@ class Baseline:
         self.row = {"iteration": self.iteration, "phase": self.phase}
         self.tell("iteration", **self.row)
         self.advance()
-        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
-        self.row |= {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
-                     "coverage": units / full if full else None}
+        self.row |= self.counts()
         self.tell("row", row=self.row)
         return self.row
 
@@ -1398,17 +1400,11 @@ def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
     return np.full((rows * height * side, across * width * side, 3), 40, np.uint8), boxes, labels
 
 
-def coverage_curve(a) -> tuple[np.ndarray, np.ndarray]:
-    """Steps, and the units covered by then."""
-    steps = np.array([0, *sorted(a.discovered.values()), a.steps])
-    return steps, np.array([0, *range(1, len(a.discovered) + 1), len(a.discovered)])
-
-
 def coverage_figure(a, name: str):
     """Coverage against agent steps."""
     figure, full = new_figure(7, 4), getattr(a.env, "full_coverage", None)
     axes = figure.subplots()
-    steps, units = coverage_curve(a)
+    steps, units = [0, *sorted(a.discovered.values()), a.steps], np.array([*range(len(a.discovered) + 1), len(a.discovered)])
     axes.step(steps, units * (100 / full if full else 1), where="post", label=name)
     if a.config.pretrain_steps:
         axes.axvspan(0, a.config.pretrain_steps, color="0.9", label="pretraining")
