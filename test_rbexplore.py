@@ -1356,6 +1356,7 @@ def test_killed_between_two_writes_and_resumed_equals_uninterrupted(finished, tm
 def test_ctrl_c_exits_with_130_leaves_figures_and_can_be_resumed(finished, tmp_path):
     code = """if True:
         import os, signal, sys, rbexplore
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job inherits that it is ignored
         train = rbexplore.RbExplore.train_novelty
         def interrupted(self, trajectories):  # so that the signal comes in iteration 6 however busy the machine is
             if self.iteration == 6:
