@@ -1,14 +1,13 @@
 """Environments that can be rolled back (paper 3.2 and 5): the contract, a small maze, the emulators, the factory.
 
-An algorithm that explores with rollbacks asks two things of an environment beyond Gymnasium's interface: take a
-snapshot of the complete state, and restore it. Coverage units (paper 5) are for metrics and figures only.
-"""
+Exploring with rollbacks asks two things of an environment beyond Gymnasium's interface: take a snapshot of the complete state,
+and restore it. Coverage units (paper 5) are for metrics and figures only."""
 
+import functools
 import gzip
 import inspect
 import tempfile
 import zlib
-from collections import deque
 from pathlib import Path
 
 import gymnasium
@@ -25,10 +24,8 @@ class InputError(ValueError):
 class PersistentEnv(gymnasium.Env):
     """A Gymnasium environment whose states can be saved and returned to: a persistent MDP (paper 3.2).
 
-    observation_space is a Box of uint8 (H, W), grayscale; action_space is Discrete. Rewards are ignored.
-    Where `step` reports info["blank"] = True, the frame is a transition screen and no state (reading R24): it is
-    stepped and counted, but has no snapshot worth keeping and never becomes a cluster's centre.
-    """
+    observation_space is a Box of uint8 (H, W), grayscale; action_space is Discrete. Rewards are ignored. Where `step` reports
+    info["blank"] = True, the frame is a transition screen and no state (R24): it is stepped and counted, but never a centre."""
 
     full_coverage: int | None = None  # number of units of full coverage (paper 5), None where it is not known
     unit_name = "units"  # what a unit is, printed beside every coverage (reading R26)
@@ -38,18 +35,13 @@ class PersistentEnv(gymnasium.Env):
         raise NotImplementedError
 
     def restore(self, snapshot: bytes) -> np.ndarray:
-        """Return to the state of `snapshot`; gives its observation, (H, W) uint8, and costs no environment step.
-
-        The same actions then give the same frames and outcomes as they did the first time, in any process.
-        Raises InputError where `snapshot` is malformed or of another environment.
-        """
+        """Return to the state of `snapshot`; gives its observation, (H, W) uint8, and costs no step. The same actions then give
+        the same frames and outcomes as the first time, in any process. InputError: malformed, or of another environment."""
         raise NotImplementedError
 
     def unit(self) -> tuple[int, ...] | None:
-        """The coverage unit in which the agent stands (paper 5), None where its position is invalid or it is dead.
-
-        For metrics only: the algorithm never sees it.
-        """
+        """The coverage unit in which the agent stands (5), None where its position is invalid or it is dead. For metrics only:
+        the algorithm never sees it."""
         raise NotImplementedError
 
     def level_map(self) -> tuple[np.ndarray, dict[tuple[int, ...], tuple[int, int, int, int]]] | None:
@@ -82,32 +74,17 @@ def check_contract(env) -> None:
 NOOP, LEFT, RIGHT, UP, DOWN, A, B = range(7)  # the seven actions of the Prince of Persia environment, in its order
 COLUMNS, ROWS = 10, 3  # tiles of a room, which is one screen
 
-# A level is drawn room by room (blocks of 10 x 3, apart by spaces and empty lines); a block of # only is no room.
+# A level is drawn in rooms of 10 x 3 tiles, apart by spaces.
 #   #  wall      _  floor       @  floor where the agent starts     .  open: no floor, one falls through
 #   ^  spikes    a  pressure plate, latched, opens every gate A     A  gate, closed until its plate is pressed
 LEVELS = {
-    1: """
-    ##.____^__ _______.__ _____.____
-    ##__.____# ___.______ ___.______
-    ####__._B_ _____^____ _c____._##
-
-    ##__.____# ##_.____## #____.____
-    ##_.______ ____^___._ #.____C___
-    ##b______# ####__.A^_ #_____._##
-
-    ##_.__^___ ____.___## ##___.____
-    #____.#### ##_.____a# ##____.___
-    #@_____### ##___##### #________#
-    """,
     2: """
     ##.____^__ _______.__ _____.____ ___.____##
     ##__.____# ___.______ ___.______ ______.___
     ####__._B_ _____^____ _c____._## #__.^____#
-
     ##__.____# ##_.____## #____.____ ##____.__#
     ##_.______ ____^___._ #.____C___ ____D__.__
     ##b______# ####__.A^_ #_____._## #.__^__e_#
-
     ##_.__^___ ____.___## ##___.____ ____._____
     #____.#### ##_.____a# ##____.___ __.___^___
     #@_____### ##___##### #________# #d__E___^#
@@ -116,66 +93,55 @@ LEVELS = {
     ##.____^__ ____^__.__ ___^_.____ ___.__^_##
     ##__.____# ___.____^_ ___.___^__ ______.___
     ####__._B_ __^__^____ _c____._## #__.^____#
-
     ##__.____# ##_.____## #__^_.____ ##____.__#
     ##_.___^__ ____^___._ #.____C___ ____D__.__
     ##b______# ####__.A^_ #_____._## #.__^__e_#
-
     ##_.__^___ ____.___## ##___.__^_ ____._____
     #____.#### ##_.____a# ##____.___ __.___^___
     #@_____### ##___##### #_.______# #d__E___^#
-
     ##_^__.___ ___^_.____ _____.__^_ __________
     #_.__^____ _.__^_____ ___.___^__ ____._____
     #___G____# #____^__g# #_^_____h# #_^__H__^#
     """,
 }
+LEVELS[1] = "\n".join(line[:36] for line in LEVELS[2].splitlines())  # its first three columns of rooms
 
-SPRITE = {  # the agent, facing right; h head, b body: drawn at 6 x 12 to a tile, sampled to the tile's real size
-    False: "...... ...... ...... ...... ..hhhh ..hhhh ..bb.. .bbbbb .bbb.b ..bb.. .bbbb. bb..bb",
-    True: "...... ...... ...... ...... ...... ...... ...... ...... ...... ...... bbbbbh bbbbhh",
-}
+# The agent, facing right, alive and dead; h head, b body: drawn at 6 x 12 to a tile, sampled to the tile's real size.
+SPRITE = ("...... ...... ...... ...... ..hhhh ..hhhh ..bb.. .bbbbb .bbb.b ..bb.. .bbbb. bb..bb",
+          "...... ...... ...... ...... ...... ...... ...... ...... ...... ...... bbbbbh bbbbhh")
 COLOURS = {"h": (255, 214, 170), "b": (255, 255, 255)}
+LUMINANCE = np.array([77, 150, 29], np.uint32)  # of red, green and blue, in 1/256
 FLOOR, STONE, STEEL, PLATE, SUNK = (186, 160, 120), (112, 98, 86), (196, 206, 214), (240, 196, 60), (84, 60, 40)
 
 
 class Maze(PersistentEnv):
     """A deterministic level of several rooms, of which the agent sees one; the reward is always 0.
-
-    LEFT and RIGHT turn the agent or, where it faces that way, run one tile. A jumps two tiles ahead, over whatever
-    is in the tile between. B steps one tile ahead, onto spikes without harm and never over an edge. UP climbs, from
-    under an opening, to the floor beside it that the agent faces. DOWN hangs from the edge ahead and lets go, which
-    takes a row off the fall. A fall of two rows or more kills, and so do spikes met in any way but by B.
-
-    unit() is (room, column, row). A snapshot is canonical: equal states have equal bytes.
-    Raises InputError for an unknown level, a frame_size that is no int or is below 32, an unknown render_mode.
-    """
+    LEFT and RIGHT turn the agent or, where it faces that way, run one tile. A jumps two tiles ahead, over whatever is in the tile
+    between. B steps one tile ahead, onto spikes without harm and never over an edge. UP climbs, from under an opening, to the
+    floor beside it that the agent faces. DOWN hangs from the edge ahead and lets go, which takes a row off the fall. A fall of
+    two rows or more kills, and so do spikes met in any way but by B.
+    unit() is (room, column, row). A snapshot is canonical: equal states have equal bytes. Raises InputError for an unknown
+    level, a frame_size that is no int or is below 32, an unknown render_mode."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     unit_name = "tiles"
 
     def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
         if level not in tuple(LEVELS):  # a tuple, since a list cannot be looked up in a dict
-            raise InputError(f"unknown maze level {level!r}: there are {', '.join(map(str, LEVELS))}")
+            raise InputError(f"unknown maze level {level!r}: there are 1, 2 and 3")
         if not isinstance(frame_size, int) or frame_size < 32:
             raise InputError(f"frame_size must be a whole number of pixels, 32 or more, and not {frame_size!r}")
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"unknown render_mode {render_mode!r}: the maze has rgb_array")
         self.level, self.frame_size, self.render_mode = level, frame_size, render_mode
-        self.tiles = read_level(LEVELS[level])
+        self.tiles = [line.replace(" ", "") for line in LEVELS[level].splitlines() if line.strip()]
         self.across, self.down = len(self.tiles[0]) // COLUMNS, len(self.tiles) // ROWS  # rooms
         self.letters = sorted({tile for line in self.tiles for tile in line if tile.islower()})
         (start,) = [(x, y) for y, line in enumerate(self.tiles) for x, tile in enumerate(line) if tile == "@"]
-        self.start = (*start, 1, 0, 0)  # x, y, facing right, plates pressed as bits, dead
-        self.state = self.start
+        self.start = self.state = (*start, 1, 0, 0)  # x, y, facing right, plates pressed as bits, dead
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._backgrounds: dict[tuple[int, int], np.ndarray] = {}
-        self._sprites = {}
-        for facing in (0, 1):
-            for dead in (0, 1):
-                colours, mask = paint_agent(facing, dead, frame_size // COLUMNS, frame_size // ROWS)
-                self._sprites[facing, dead] = grayscale(colours), mask
+        self._seen = functools.lru_cache(4096)(self._draw)  # frames of the states met lately
         self.full_coverage = len(self.reachable())
 
     def reset(self, *, seed=None, options=None):
@@ -204,20 +170,16 @@ class Maze(PersistentEnv):
 
     def unit(self) -> tuple[int, int, int] | None:
         """(room, column, row) of the living agent, None of a dead one."""
-        return self._unit(self.state)
+        x, y, *_, dead = self.state
+        return None if dead else (self._room(x, y), x % COLUMNS, y % ROWS)
 
     def render(self) -> np.ndarray | None:
         """The room in which the agent is, (360, 360, 3) uint8; None without a render_mode."""
-        if self.render_mode is None:
-            return None
-        x, y, facing, plates, dead = self.state
-        picture = self._paint_room(self._room(x, y), plates, 36, 120)
-        stamp(picture, *paint_agent(facing, dead, 36, 120), x % COLUMNS * 36, y % ROWS * 120)
-        return picture
+        return None if self.render_mode is None else self._picture(self.state, 36, 120)
 
     def reachable(self) -> set[tuple[int, int, int]]:
         """Every unit in which the agent can stand alive, by breadth-first search over the full states."""
-        return {self._unit(state) for state in self._search(self.start) if not state[4]}
+        return {(self._room(x, y), x % COLUMNS, y % ROWS) for x, y, *_, dead in self._search(self.start) if not dead}
 
     def distances(self, snapshot: bytes) -> dict[bytes, int]:
         """Steps from the state of `snapshot` to every full state that follows from it, dead ones too, by snapshot."""
@@ -225,35 +187,21 @@ class Maze(PersistentEnv):
 
     def level_map(self) -> tuple[np.ndarray, dict[tuple[int, int, int], tuple[int, int, int, int]]]:
         """The whole level with tiles of 8 x 24 pixels, nothing pressed yet; a box for each reachable unit."""
-        w, h, gap = 8, 24, 2
-        room_w, room_h = COLUMNS * w + gap, ROWS * h + gap
-        picture = np.full((self.down * room_h + gap, self.across * room_w + gap, 3), 12, np.uint8)
-        corner = {}
-        for room in range(self.down * self.across):
-            top, left = room // self.across * room_h + gap, room % self.across * room_w + gap
-            corner[room] = left, top
-            x, y = room % self.across * COLUMNS, room // self.across * ROWS
-            if any(set(line[x : x + COLUMNS]) != {"#"} for line in self.tiles[y : y + ROWS]):
-                picture[top : top + ROWS * h, left : left + COLUMNS * w] = self._paint_room(room, 0, w, h)
-        units = self.reachable()
-        return picture, {u: (corner[u[0]][0] + u[1] * w, corner[u[0]][1] + u[2] * h, w, h) for u in units}
-
-    # -- the rules
+        w, h, across = 8, 24, self.across
+        rows = [np.hstack([self._paint_room(k * across + i, 0, w, h) for i in range(across)]) for k in range(self.down)]
+        return np.vstack(rows), {(room, x, y): ((room % across * COLUMNS + x) * w, (room // across * ROWS + y) * h, w, h)
+                                 for room, x, y in self.reachable()}
 
     def _tile(self, x: int, y: int, plates: int) -> str:
         """The tile as it acts now: beyond the level and at a closed gate there is wall, at an open one floor."""
-        if not (0 <= y < len(self.tiles) and 0 <= x < len(self.tiles[0])):
-            return "#"
-        tile = self.tiles[y][x]
-        if tile.isupper():
-            return "_" if plates >> self.letters.index(tile.lower()) & 1 else "#"
-        return tile
+        tile = self.tiles[y][x] if 0 <= y < len(self.tiles) and 0 <= x < len(self.tiles[0]) else "#"
+        opened = tile.isupper() and plates >> self.letters.index(tile.lower()) & 1
+        return "_" if opened else "#" if tile.isupper() else tile
 
     def _next(self, state: tuple, action: int) -> tuple:
         """The state after one action."""
         x, y, facing, plates, _ = state
-        ahead = 1 if facing else -1
-        hang = 0
+        ahead, hang = 1 if facing else -1, 0
         if action in (LEFT, RIGHT) and facing != (action == RIGHT):
             facing = 1 - facing
         elif action in (LEFT, RIGHT) and self._tile(x + ahead, y, plates) != "#":
@@ -279,9 +227,8 @@ class Maze(PersistentEnv):
 
     def _search(self, start: tuple) -> dict[tuple, int]:
         """Breadth-first: each state that follows from `start`, with its distance in steps."""
-        steps, queue = {start: 0}, deque([start])
-        while queue:
-            state = queue.popleft()
+        steps, queue = {start: 0}, [start]
+        for state in queue:  # which grows meanwhile
             for action in range(0 if state[4] else 7):
                 after = self._next(state, action)
                 if after not in steps:
@@ -290,36 +237,32 @@ class Maze(PersistentEnv):
         return steps
 
     def _read(self, snapshot: bytes) -> tuple:
-        if not (isinstance(snapshot, bytes) and len(snapshot) == 6 and snapshot[0] == self.level):
-            raise InputError(f"no snapshot of maze level {self.level}: {snapshot!r:.60}")
-        x, y, facing, plates, dead = state = tuple(snapshot[1:])
-        if facing > 1 or dead > 1 or plates >> len(self.letters) or self._tile(x, y, plates) in "#.":
-            raise InputError(f"malformed snapshot of maze level {self.level}: {snapshot!r}")
-        return state
+        if isinstance(snapshot, bytes) and len(snapshot) == 6 and snapshot[0] == self.level:
+            x, y, facing, plates, dead = state = tuple(snapshot[1:])
+            if facing < 2 and dead < 2 and not plates >> len(self.letters) and self._tile(x, y, plates) not in "#.":
+                return state
+        raise InputError(f"no snapshot of maze level {self.level}: {snapshot!r:.60}")
 
     def _room(self, x: int, y: int) -> int:
         return y // ROWS * self.across + x // COLUMNS
 
-    def _unit(self, state: tuple) -> tuple[int, int, int] | None:
-        x, y, _, _, dead = state
-        return None if dead else (self._room(x, y), x % COLUMNS, y % ROWS)
-
-    # -- what is seen
-
     def _frame(self) -> np.ndarray:
-        """The observation: the agent stamped on its room, whose background is painted once for each look it has."""
-        x, y, facing, plates, dead = self.state
-        room, size = self._room(x, y), self.frame_size
-        w, h = size // COLUMNS, size // ROWS
-        left, top = (size - COLUMNS * w) // 2, (size - ROWS * h) // 2
-        if (room, plates) not in self._backgrounds:
-            background = np.zeros((size, size), np.uint8)
-            picture = grayscale(self._paint_room(room, plates, w, h))
-            background[top : top + ROWS * h, left : left + COLUMNS * w] = picture
-            self._backgrounds[room, plates] = background
-        frame = self._backgrounds[room, plates].copy()
-        stamp(frame, *self._sprites[facing, dead], left + x % COLUMNS * w, top + y % ROWS * h)
+        return self._seen(self.state).copy()
+
+    def _draw(self, state: tuple) -> np.ndarray:
+        """The observation: luminance, in whole numbers so that every machine agrees, centred on black."""
+        size, frame = self.frame_size, np.zeros((self.frame_size, self.frame_size), np.uint8)
+        picture = self._picture(state, size // COLUMNS, size // ROWS)
+        top, left = ((size - side) // 2 for side in picture.shape[:2])
+        frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.astype(np.uint32) @ LUMINANCE >> 8
         return frame
+
+    def _picture(self, state: tuple, w: int, h: int) -> np.ndarray:
+        """The room with the agent, (3 h, 10 w, 3) uint8."""
+        x, y, facing, plates, dead = state
+        picture = self._paint_room(self._room(x, y), plates, w, h)
+        paint_agent(picture[y % ROWS * h :, x % COLUMNS * w :][:h, :w], facing, dead)
+        return picture
 
     def _paint_room(self, room: int, plates: int, w: int, h: int) -> np.ndarray:
         """The room without the agent, (3 h, 10 w, 3) uint8; plates and gates show their state."""
@@ -329,76 +272,32 @@ class Maze(PersistentEnv):
         shade = 18 + room * 5 % 7 * 8 + 16 * pattern[room % 5]
         tint = ((0.8, 0.9, 1.3), (1.2, 0.9, 0.8), (0.8, 1.1, 0.8))[room % 3]
         picture = (shade[..., None] * np.array(tint)).astype(np.uint8)
-        for row in range(ROWS):
-            for column in range(COLUMNS):
-                tile = self.tiles[room // self.across * ROWS + row][room % self.across * COLUMNS + column]
-                box = picture[row * h : (row + 1) * h, column * w : (column + 1) * w]
-                pressed = tile.isalpha() and plates >> self.letters.index(tile.lower()) & 1
-                if tile == "#":
-                    box[:] = STONE
-                    box[::thick * 2] = np.array(STONE) * 3 // 4  # joints
-                elif tile != ".":
-                    box[-thick:] = FLOOR
-                if tile == "^":
-                    for i in range(w):  # two teeth
-                        tooth = round(0.3 * h * (1 - abs((2 * i + 1) / w % 1 * 2 - 1)))
-                        box[h - thick - tooth : h - thick, i] = STEEL
-                elif tile.islower():
-                    box[-thick if pressed else -2 * thick :] = SUNK if pressed else PLATE
-                elif tile.isupper():
-                    bars = np.arange(w) // pixel % 2 == 0
-                    box[: h // 5 if pressed else h - thick, bars] = STEEL
+        for row, column in np.ndindex(ROWS, COLUMNS):
+            tile = self.tiles[room // self.across * ROWS + row][room % self.across * COLUMNS + column]
+            box = picture[row * h : (row + 1) * h, column * w : (column + 1) * w]
+            pressed = tile.isalpha() and plates >> self.letters.index(tile.lower()) & 1
+            if tile == "#":
+                box[:] = STONE
+                box[::thick * 2] = np.array(STONE) * 3 // 4  # joints
+            elif tile != ".":
+                box[-thick:] = FLOOR
+            if tile == "^":
+                for i in range(w):  # two teeth
+                    box[h - thick - round(0.3 * h * (1 - abs((2 * i + 1) / w % 1 * 2 - 1))) : h - thick, i] = STEEL
+            elif tile.islower():
+                box[-thick if pressed else -2 * thick :] = SUNK if pressed else PLATE
+            elif tile.isupper():
+                box[: h // 5 if pressed else h - thick, np.arange(w) // pixel % 2 == 0] = STEEL  # bars
         return picture
 
 
-def read_level(drawing: str) -> list[str]:
-    """The level's lines of tiles, rooms joined. Raises InputError where the drawing breaks a rule of levels."""
-    lines = ["".join(line.split()) for line in drawing.splitlines() if line.strip()]
-    tiles = {(x, y): tile for y, line in enumerate(lines) for x, tile in enumerate(line)}
-    letters = {tile for tile in tiles.values() if tile.isalpha()}
-    rooms = {tile: {(x // COLUMNS, y // ROWS) for (x, y), t in tiles.items() if t == tile} for tile in letters}
-    rules = {
-        "rooms of 10 x 3 tiles": len({len(s) for s in lines}) == 1 and not (len(lines[0]) % COLUMNS or len(lines) % ROWS),
-        "known tiles": set(tiles.values()) - letters <= set("#_@.^"),
-        "one start": list(tiles.values()).count("@") == 1,
-        "a plate for each gate, a gate for each plate, 8 at most": letters == {t.swapcase() for t in letters}
-        and len(letters) <= 16,
-        "ground under each opening": all(tiles.get((x, y + 1), "#") not in "#" and not tiles[x, y + 1].isupper()
-                                         for (x, y), t in tiles.items() if t == "."),
-        "gates in a room beside their plate's": all(max(abs(i - k), abs(j - m)) == 1 for t in letters if t.islower()
-                                                   for i, j in rooms[t] for k, m in rooms.get(t.upper(), ())),
-    }
-    for rule, holds in rules.items():
-        if not holds:
-            raise InputError(f"a maze level needs {rule}")
-    return lines
-
-
-def paint_agent(facing: int, dead: int, w: int, h: int) -> tuple[np.ndarray, np.ndarray]:
-    """The agent in a tile: colours (h, w, 3) uint8 and the mask (h, w) of its pixels."""
-    lines = np.array([list(line if facing else line[::-1]) for line in SPRITE[bool(dead)].split()])
-    floor = max(1, h // 8)
-    body = lines[np.minimum((2 * np.arange(h - floor) + 1) * 12 // (2 * (h - floor)), 11)]
-    body = body[:, (2 * np.arange(w) + 1) * 6 // (2 * w)]
-    colours, mask = np.zeros((h, w, 3), np.uint8), np.zeros((h, w), bool)
+def paint_agent(box: np.ndarray, facing: int, dead: int) -> None:
+    """Paint the agent over a tile, (h, w, 3) uint8, in place: above its floor, the sprite sampled to that size."""
+    lines = np.array([list(line if facing else line[::-1]) for line in SPRITE[dead].split()])
+    h, w = len(box) - max(1, len(box) // 8), box.shape[1]
+    body = lines[np.minimum((2 * np.arange(h) + 1) * 12 // (2 * h), 11)][:, (2 * np.arange(w) + 1) * 6 // (2 * w)]
     for letter, colour in COLOURS.items():
-        colours[: h - floor][body == letter] = colour
-        mask[: h - floor] |= body == letter
-    return colours, mask
-
-
-def stamp(picture: np.ndarray, colours: np.ndarray, mask: np.ndarray, left: int, top: int) -> None:
-    """Lay the agent over a picture, in place."""
-    h, w = mask.shape
-    picture[top : top + h, left : left + w][mask] = colours[mask]
-
-
-def grayscale(picture: np.ndarray) -> np.ndarray:
-    """Luminance of (H, W, 3) uint8 as (H, W) uint8, in whole numbers so that every machine agrees."""
-    return (picture.astype(np.uint32) @ np.array([77, 150, 29], np.uint32) >> 8).astype(np.uint8)
-
-
-gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
+        box[:h][body == letter] = colour
 
 
 # ---- the emulators (3.2, 5, 6.1; S3.2-01, S3.2-02, S5-*, S6.1-01, S6.1-07, S6.2-01, S6.2-02) --------
@@ -406,23 +305,17 @@ gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
 FRAMESKIP = 4  # emulator frames a step (6.1)
 
 
-def _average(image: np.ndarray, size: int) -> np.ndarray:
-    """Area-average the first axis to `size`, times its length. Whole numbers: exact, the same everywhere."""
-    height, left = len(image), np.arange(size) * len(image)  # each row counts as `size` parts
-    total = np.zeros((size, image.shape[1]), np.int32)
-    for row in (left // size + i for i in range(height // size + 2)):
-        parts = np.minimum(left + height, (row + 1) * size) - np.maximum(left, row * size)
-        total += parts.clip(0)[:, None].astype(np.int32) * image[np.minimum(row, height - 1)]
-    return total
+def _overlaps(pixels: int, size: int) -> np.ndarray:
+    """(size, pixels): how much of each pixel lies in each of `size` equal parts; `size` is a whole pixel."""
+    part, pixel = np.arange(size)[:, None] * pixels, np.arange(pixels) * size
+    return (np.minimum(part + pixels, pixel + size) - np.maximum(part, pixel)).clip(0).astype(float)
 
 
 class EmulatorEnv(PersistentEnv):
     """What the emulators share: preprocessing (6.1), snapshots (3.2) and the end of an episode (R23).
-
-    Observations are the last frame of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8.
-    The reward is 0.0. info holds the subclass's readings of RAM, and "blank": no pixel is lit (R24).
-    A subclass has _tick and _ram, sets _emulator and its _screen, _save and _load, then calls _begin.
-    """
+    Observations are the last frame of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8. The reward is 0.0.
+    info holds the subclass's readings of RAM, and "blank": no pixel is lit (R24). A subclass has _tick and _ram, sets _emulator
+    and its _screen, _save and _load, then calls _begin."""
 
     LIVES = "lives"  # the reading whose drop ends the episode
     level: int | None = None  # the level whose leaving ends it, where RAM tells the level
@@ -438,8 +331,8 @@ class EmulatorEnv(PersistentEnv):
 
     def _observe(self) -> np.ndarray:
         luma = self._screen().astype(np.float32) @ np.float32([299, 587, 114])  # (H, W), whole numbers
-        gray, size = np.rint(luma / 1000).astype(np.int32), self.observation_space.shape[0]
-        return (_average(_average(gray, size).T, size).T // gray.size).astype(np.uint8)
+        down, across = (_overlaps(pixels, self.observation_space.shape[0]) for pixels in luma.shape)
+        return (down @ np.rint(luma / 1000) @ across.T // luma.size).astype(np.uint8)  # whole numbers: exact everywhere
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """Back to s_init, the same state every time. Returns (frame, info)."""
@@ -454,8 +347,8 @@ class EmulatorEnv(PersistentEnv):
             self._tick(action)
         frame, ram = self._observe(), self._ram()
         self._frame = frame.tobytes()
-        terminated = ram[self.LIVES] < lives or ram.get("level") != self.level
-        return frame, 0.0, terminated, False, {**ram, "blank": not frame.any()}
+        ended = ram[self.LIVES] < lives or ram.get("level") != self.level
+        return frame, 0.0, ended, False, {**ram, "blank": not frame.any()}
 
     def snapshot(self) -> bytes:
         """The emulator's whole state and the frame, as emulators restore no screen; bytes, compressed."""
@@ -482,14 +375,11 @@ class EmulatorEnv(PersistentEnv):
 
 class PrinceOfPersia(EmulatorEnv):
     """One level of Prince of Persia on the NES, through stable-retro (section 5).
-
-    rom: the user's cartridge image, an iNES file. state: the gzip of an emulator state, as the authors
-    publish them (level 1: in the sword's room with the sword, 6.2). As a state has no screen, s_init comes
-    one frame without buttons after it. Without `state`, s_init is one second after power-on: only for a
-    cartridge that is then in play on `level`, as no action is START. The clock is held at 99 minutes.
-    info: level, room, x, y (pixels), hit_points and sword, and "blank".
-    InputError: an unusable file, another level's state, no stable-retro, a second emulator in the process.
-    """
+    rom: the user's cartridge image, an iNES file. state: the gzip of an emulator state, as the authors publish them (level 1: in
+    the sword's room with the sword, 6.2). As a state has no screen, s_init comes one frame without buttons after it. Without
+    `state`, s_init is one second after power-on: only for a cartridge that is then in play on `level`, as no action is START.
+    The clock is held at 99 minutes. info: level, room, x, y (pixels), hit_points and sword, and "blank".
+    InputError: an unusable file, another level's state, no stable-retro, a second emulator in the process."""
 
     ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # section 5; NO-OP names no button
     # Units in the full coverage sets of levels 1 to 14, counted from the authors' reference data (R26).
@@ -542,8 +432,7 @@ class PrinceOfPersia(EmulatorEnv):
     def _tick(self, action):
         self._emulator.set_button_mask(self._masks[action])
         self._emulator.step()
-        for digit in 1221, 1222:  # minutes left
-            self._data.memory.assign(digit, "|u1", ord("9"))
+        self._data.memory.assign(1221, "<u2", 0x3939)  # two digits, 9 and 9: the minutes left
 
     def _ram(self):
         read = self._data.memory.extract
@@ -559,11 +448,9 @@ class PrinceOfPersia(EmulatorEnv):
 
 class Montezuma(EmulatorEnv):
     """Montezuma's Revenge through ale-py, which brings the game: not in the paper, but needs no cartridge.
-
-    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames, which a
-    chain of rollbacks would reach. ALE's minimal set of actions: here all 18. No full coverage set is known.
-    info: room, x, y (ALE pixels) and lives, and "blank".
-    """
+    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames, which a chain of rollbacks
+    would reach. ALE's minimal set of actions: here all 18. No full coverage set is known. info: room, x, y (ALE pixels) and
+    lives, and "blank"."""
 
     unit_name = "units of 16 x 16 pixels"
 
@@ -592,12 +479,13 @@ class Montezuma(EmulatorEnv):
 
     def unit(self) -> tuple[int, int, int]:
         """(room, x // 16, y // 16): a tenth of the screen's width, as a plate is of the Prince's room."""
-        ram = self._ram()
-        return ram["room"], ram["x"] // 16, ram["y"] // 16
+        room, x, y, _ = self._ram().values()
+        return room, x // 16, y // 16
 
 
 # ---- The factory by name -----------------------------------------------------------------------------------------
 
+gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
 ENVIRONMENTS = {"maze": Maze, "pop": PrinceOfPersia, "montezuma": Montezuma}
 
 
@@ -606,7 +494,6 @@ def make_env(name: str, **options) -> PersistentEnv:
     if name not in ENVIRONMENTS:
         raise InputError(f"unknown environment {name!r}: there are {', '.join(ENVIRONMENTS)}")
     known = inspect.signature(ENVIRONMENTS[name]).parameters
-    for option in options:
-        if option not in known:
-            raise InputError(f"{name} has no option {option!r}: it has {', '.join(known)}")
+    if unknown := [option for option in options if option not in known]:
+        raise InputError(f"{name} has no option {unknown[0]!r}: it has {', '.join(known)}")
     return ENVIRONMENTS[name](**options)
