@@ -478,9 +478,9 @@ class Montezuma(EmulatorEnv):
         return {"room": room, "x": x, "y": y, "lives": lives}
 
     def unit(self) -> tuple[int, int, int]:
-        """(room, x // 16, y // 16): a tenth of the screen's width, as a plate is of the Prince's room."""
+        """(room, column, row) of 16 pixels: a tenth of the screen's width, as a plate is of the Prince's room."""
         room, x, y, _ = self._ram().values()
-        return room, x // 16, y // 16
+        return room, x // 16, 15 - y // 16  # RAM counts y upwards
 
 
 # ---- The factory by name -----------------------------------------------------------------------------------------

@@ -1828,7 +1828,7 @@ def test_a_library_that_is_not_installed(tmp_path, monkeypatch, library, make):
 def test_montezuma_ends_with_a_life_starts_alike_and_counts_rooms(montezuma):
     env, twin, rng = montezuma, Montezuma(), np.random.default_rng(0)
     assert env.reset()[1] == {"room": 1, "x": 77, "y": 235, "lives": 5, "blank": False}
-    assert env.snapshot() == twin.snapshot() and env.unit() == (1, 4, 14) and env.full_coverage is None
+    assert env.snapshot() == twin.snapshot() and env.unit() == (1, 4, 1) and env.full_coverage is None
     assert env._emulator.getFloat("repeat_action_probability") == 0  # twins share a seed
     lives, ended = 5, 0
     for action in rng.integers(18, size=600).tolist():
@@ -1840,6 +1840,16 @@ def test_montezuma_ends_with_a_life_starts_alike_and_counts_rooms(montezuma):
 
 def test_gymnasium_accepts_the_cartridge(prince):
     check_env(prince, skip_render_check=True)
+
+
+def test_a_way_down_in_montezuma_is_a_way_down_on_its_map(montezuma):
+    montezuma.reset()
+    units = [montezuma.unit()]
+    for _ in range(22):  # down the ladder that the game begins on
+        montezuma.step(5)
+        units.append(montezuma.unit())
+    rows = [row for _, _, row in units]
+    assert rows == sorted(rows) and rows[-1] > rows[0] + 2
 
 
 def test_gymnasium_accepts_montezuma(montezuma):
