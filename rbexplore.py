@@ -1363,7 +1363,7 @@ def new_figure(width: float, height: float):
 
 def draw_figures(run: Run) -> list[str]:
     """Draw what the run has found so far; returns the names of the files."""
-    a, folder = run.algorithm, run.folder
+    a = run.algorithm
     unit_of = {}  # cluster -> coverage unit, by rolling back: G itself does not know units
     graph = None if isinstance(a, Baseline) else a.graph
     for v, cluster in graph.clusters.items() if graph else ():
@@ -1371,22 +1371,33 @@ def draw_figures(run: Run) -> list[str]:
         if a.env.unit() is not None:
             unit_of[v] = unit_key(a.env.unit())
     a.env.restore(a.snap_init)
-    drawn = a.env.level_map() if hasattr(a.env, "level_map") else None
-    level, boxes, labels = (*drawn, []) if drawn else rooms_map({*a.discovered, *unit_of.values()})
-    figures = {"coverage.png": coverage_figure(a, run.settings["method"])}
+    drawing, grid = level_drawing(a.env, {*a.discovered, *unit_of.values()}), np.linspace(0, a.steps, 1001).astype(int)
+    full, unit = getattr(a.env, "full_coverage", None), unit_name(a.env)
+    curves = {run.settings["method"]: {a.config.seed: coverage_curve(a.discovered, grid, full)}}
+    figures = {"coverage.png": curves_figure(grid, curves, full, unit, a.config.pretrain_steps)}
     if graph:
         figures["centres.png"] = centres_figure(a)
-    if boxes:
-        figures["coverage_map.png"] = map_figure(a, level, boxes, labels)
-        figures |= {"graph.png": graph_figure(a, level, boxes, labels, unit_of)} if graph else {}
-    for name, figure in figures.items():
-        write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+    if drawing[1]:
+        share = f"{100 * len(a.discovered) / full:.1f} % of {full}" if full else f"{len(a.discovered)}"
+        figures["coverage_map.png"] = maps_figure(drawing, {f"after {a.steps:,} steps: {share} {unit}": a.discovered}, a.steps)
+        figures |= {"graph.png": graph_figure(a, drawing, unit_of)} if graph else {}
+    save_figures(run.folder, figures)
     return list(figures)
 
 
+def save_figures(folder: pathlib.Path, figures: dict) -> None:
+    for name, figure in figures.items():
+        write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+
+
+def level_drawing(env, units: set[tuple]) -> tuple[np.ndarray, dict, list]:
+    """A picture of the level (H, W, 3), the box of each unit in it (left, top, width, height), and names (x, y, name)."""
+    drawn = env.level_map() if hasattr(env, "level_map") else None
+    return (*drawn, []) if drawn else rooms_map(units)
+
+
 def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
-    """Where the environment draws no level: a panel for each room, in it a square for each unit (room, x, y) known.
-    Returns the picture, the box of each unit, and for each panel (x, y, name)."""
+    """Where the environment draws no level: a panel for each room, in it a square for each unit (room, x, y) known."""
     places = {u: (u[:-2], *((0, 0, *u)[-2:])) for u in units}  # (5,) is x = 0, y = 5 of the only room
     rooms, xs, ys = (sorted({place[k] for place in places.values()}) for k in range(3))
     if not units or not all(isinstance(x, int) for x in (*xs, *ys)):
@@ -1400,17 +1411,24 @@ def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
     return np.full((rows * height * side, across * width * side, 3), 40, np.uint8), boxes, labels
 
 
-def coverage_figure(a, name: str):
-    """Coverage against agent steps."""
-    figure, full = new_figure(7, 4), getattr(a.env, "full_coverage", None)
+def coverage_curve(discovered: dict[tuple, int], grid: np.ndarray, full: int | None) -> np.ndarray:
+    """Coverage after each number of steps of the grid: %, or units where full coverage is not known."""
+    return np.searchsorted(sorted(discovered.values()), grid, "right") * (100 / full if full else 1)
+
+
+def curves_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], full: int | None, unit: str, pretraining: int = 0):
+    """Coverage against agent steps: for each variant the mean of its runs, and a band from their least to their most."""
+    figure = new_figure(7, 4)
     axes = figure.subplots()
-    steps, units = [0, *sorted(a.discovered.values()), a.steps], np.array([*range(len(a.discovered) + 1), len(a.discovered)])
-    axes.step(steps, units * (100 / full if full else 1), where="post", label=name)
-    if a.config.pretrain_steps:
-        axes.axvspan(0, a.config.pretrain_steps, color="0.9", label="pretraining")
-    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, None), ylim=(0, 102 if full else None),
-             ylabel=f"coverage, % of {full} {unit_name(a.env)}" if full else f"{unit_name(a.env)} covered")
-    axes.legend(loc="lower right")
+    for variant, of in curves.items():
+        runs = np.stack(list(of.values()))  # (runs, points of the grid)
+        (line,) = axes.plot(grid, runs.mean(0), label=variant)
+        axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
+    if pretraining:
+        axes.axvspan(0, pretraining, color="0.9", label="pretraining")
+    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, grid[-1]), ylim=(0, 102 if full else None),
+             ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered")
+    axes.legend()
     return figure
 
 
@@ -1418,39 +1436,39 @@ def unit_name(env) -> str:
     return getattr(env, "unit_name", "units")
 
 
-def map_axes(level: np.ndarray, labels: list, title: str):
-    figure = new_figure(10, 10 * level.shape[0] / level.shape[1] + 0.9)
-    axes = figure.subplots()
+def show_level(axes, level: np.ndarray, labels: list, title: str) -> None:
     axes.imshow(level)
     axes.set(title=title, xticks=[], yticks=[])
     for x, y, name in labels:
         axes.text(x, y, name, color="white", fontsize=8, verticalalignment="bottom")
-    return figure, axes
 
 
-def map_figure(a, level: np.ndarray, boxes: dict, labels: list) -> object:
-    """The level, its visited units coloured by the step of the first visit, the others crossed out."""
-    full = getattr(a.env, "full_coverage", None)
-    share = f"{100 * len(a.discovered) / full:.1f} % of {full}" if full else f"{len(a.discovered)}"
-    figure, axes = map_axes(level, labels, f"coverage after {a.steps:,} steps: {share} {unit_name(a.env)}")
-    figure.colorbar(draw_map(axes, level, boxes, a.discovered, a.steps), label="step of the first visit", shrink=0.8)
+def maps_figure(drawing: tuple, found: dict[str, dict[tuple, int]], steps: int):
+    """Coverage maps, one for each title: visited units coloured by the step of the first visit, the others crossed out."""
+    level, boxes, labels = drawing
+    across, width = min(3, len(found)), 10 if len(found) == 1 else 5
+    down = math.ceil(len(found) / across)
+    figure = new_figure(width * across + 1.5, (width * level.shape[0] / level.shape[1] + 0.7) * down)
+    panels = figure.subplots(down, across, squeeze=False).ravel()
+    for axes, (title, discovered) in zip(panels, found.items(), strict=False):
+        show_level(axes, level, labels, title)
+        heat = np.full(level.shape[:2], np.nan)
+        for unit, (x, y, w, h) in boxes.items():
+            if unit in discovered:
+                heat[y : y + h, x : x + w] = discovered[unit]
+            else:
+                axes.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
+        image = axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=steps)
+    figure.colorbar(image, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
     return figure
 
 
-def draw_map(axes, level: np.ndarray, boxes: dict, discovered: dict[tuple, int], steps: int):
-    axes.imshow(level)
-    heat = np.full(level.shape[:2], np.nan)
-    for unit, (x, y, w, h) in boxes.items():
-        if unit in discovered:
-            heat[y : y + h, x : x + w] = discovered[unit]
-        else:
-            axes.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
-    return axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=steps)
-
-
-def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, labels: list, unit_of: dict) -> object:
+def graph_figure(a: RbExplore, drawing: tuple, unit_of: dict):
     """G over the level: a disc for each cluster, its area by the visits; a line for each arc, its width by the visits."""
-    figure, axes = map_axes(level, labels, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
+    level, boxes, labels = drawing
+    figure = new_figure(10, 10 * level.shape[0] / level.shape[1] + 0.9)
+    axes = figure.subplots()
+    show_level(axes, level, labels, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
     place, crowd = {}, Counter()
     for v, unit in unit_of.items():
         if unit in boxes:
@@ -1470,7 +1488,7 @@ def graph_figure(a: RbExplore, level: np.ndarray, boxes: dict, labels: list, uni
     return figure
 
 
-def centres_figure(a: RbExplore, most: int = 80) -> object:
+def centres_figure(a: RbExplore, most: int = 80):
     """A contact sheet: the centres of the clusters, at most so many, evenly from all, with number and visits."""
     ids = list(a.graph.clusters)
     shown = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).astype(int))]
@@ -1631,7 +1649,7 @@ def experiment(args: argparse.Namespace) -> int:
         state = torch.load(pathlib.Path(command[-1]) / "checkpoint.pt", map_location="cpu", weights_only=True)["algorithm"]
         found[variant, seed] = {tuple(unit): step for unit, step in state["discovered"]}
         times = sorted(found[variant, seed].values())
-        curves.setdefault(variant, {})[seed] = np.searchsorted(times, grid, "right") * (100 / full if full else 1)
+        curves.setdefault(variant, {})[seed] = coverage_curve(found[variant, seed], grid, full)
         needed = [math.ceil(p * (full or 0) / 100) for p in (50, 90, 100)]
         marks = ", ".join(f"{times[k - 1]:,}" if len(times) >= k else "-" for k in needed)
         unit = f"%; steps to 50, 90, 100 %: {marks}" if full else "units"
@@ -1639,11 +1657,12 @@ def experiment(args: argparse.Namespace) -> int:
     rows = [f"{v},{n},{x},{y:.4f}" for v, of in curves.items() for n, ys in of.items() for x, y in zip(grid, ys, strict=True)]
     write_atomically(out / "curves.csv", lambda f: f.write("\n".join(["variant,seed,steps,coverage", *rows, ""]).encode()))
     if not args.no_figures:
-        figures = {"curves.png": band_figure(grid, curves, full)}
+        figures = {"curves.png": curves_figure(grid, curves, full, unit_name(env))}
         if args.experiment == "methods":
-            figures["maps.png"] = maps_figure(env, {v: found[v, best(of)] for v, of in curves.items()}, int(grid[-1]))
-        for name, figure in figures.items():
-            write_atomically(out / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+            shown = {variant: found[variant, best(of)] for variant, of in curves.items()}
+            figures["maps.png"] = maps_figure(level_drawing(env, set().union(*shown.values())),
+                                              {f"{v}: {len(d)} {unit_name(env)}": d for v, d in shown.items()}, int(grid[-1]))
+        save_figures(out, figures)
     print(f"{out}: curves.csv{'' if args.no_figures else ', ' + ', '.join(figures)}")
     return 0
 
@@ -1651,34 +1670,6 @@ def experiment(args: argparse.Namespace) -> int:
 def best(curves: dict[int, np.ndarray]) -> int:
     """The seed whose coverage is highest at the end (S6.2-06)."""
     return max(curves, key=lambda seed: curves[seed][-1])
-
-
-def band_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], full: int | None):
-    """Coverage against agent steps: for each variant the mean of its runs, and a band from their least to their most."""
-    figure = new_figure(7, 4)
-    axes = figure.subplots()
-    for variant, of in curves.items():
-        runs = np.stack(list(of.values()))  # (runs, 201)
-        (line,) = axes.plot(grid, runs.mean(0), label=variant)
-        axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
-    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, grid[-1]), ylim=(0, 102 if full else None),
-             ylabel=f"coverage, % of {full} units" if full else "units covered")
-    axes.legend()
-    return figure
-
-
-def maps_figure(env, found: dict[str, dict[tuple, int]], steps: int):
-    """The coverage maps of several runs side by side."""
-    drawn = env.level_map() if hasattr(env, "level_map") else None
-    level, boxes = drawn or rooms_map(set().union(*found.values()))[:2]
-    across = min(3, len(found))
-    figure = new_figure(5 * across, 5.6 * level.shape[0] / level.shape[1] * math.ceil(len(found) / across))
-    panels = figure.subplots(math.ceil(len(found) / across), across, squeeze=False).ravel()
-    for axes, (variant, discovered) in zip(panels, found.items(), strict=False):
-        image = draw_map(axes, level, boxes, discovered, steps)
-        axes.set(title=f"{variant}: {len(discovered)} units", xticks=[], yticks=[])
-    figure.colorbar(image, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
-    return figure
 
 
 # ----------------------------------------------------------------------------------------------------- the command line

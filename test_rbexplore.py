@@ -57,7 +57,6 @@ from rbexplore import (
     RNDBonus,
     SimilarityModel,
     Trajectory,
-    band_figure,
     best,
     coarse,
     exact,
@@ -2123,7 +2122,7 @@ def test_methods_resume_as_if_never_interrupted(method):
 
 def test_S6_2_05_band_is_min_to_max_and_S6_2_06_best_is_by_final_coverage():
     grid, curves = np.array([0, 5, 10]), {0: np.array([0.0, 9, 10]), 1: np.array([0.0, 1, 12]), 2: np.array([0.0, 2, 5])}
-    (axes,) = band_figure(grid, {"rnd": curves}, 100).axes
+    (axes,) = rb.curves_figure(grid, {"rnd": curves}, 100, "tiles").axes
     assert axes.lines[0].get_ydata().tolist() == [0, 4, 9]
     edge = {tuple(map(float, point)) for point in axes.collections[0].get_paths()[0].vertices}
     assert edge == {(0, 0), (5, 1), (5, 9), (10, 5), (10, 12)} and best(curves) == 1
