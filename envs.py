@@ -440,9 +440,9 @@ class PrinceOfPersia(EmulatorEnv):
                 "y": read(1777, "|u1") & 224, "hit_points": read(1743, "|u1"), "sword": read(1774, "|u1")}
 
     def unit(self) -> tuple[int, int, int] | None:
-        """(room, x // 32, y // 32). None outside the room (left of it x wraps to 65535) or the level."""
+        """(room, x // 32, y // 32). None of the dead, outside the room (left of it x wraps to 65535) or the level."""
         ram = self._ram()
-        valid = ram["level"] == self.level and ram["x"] <= 332 and 32 <= ram["y"] <= 192
+        valid = ram["level"] == self.level and ram["x"] <= 332 and 32 <= ram["y"] <= 192 and ram["hit_points"]
         return (ram["room"], ram["x"] // 32, ram["y"] // 32) if valid else None
 
 

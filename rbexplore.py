@@ -180,8 +180,7 @@ class RbExplore:
 
     def iterate(self) -> dict:
         """One iteration: the paper's five steps in the paper's order. Returns its metrics."""
-        if self.steps >= self.config.steps:
-            raise InputError(f"the budget of {self.config.steps} steps is spent: give more steps to go on")
+        self.check_budget()
         if self.phase == "pretrain" and self.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
@@ -197,6 +196,10 @@ class RbExplore:
         self.row |= self.counts() | {"clusters": len(self.graph.clusters)}
         self.tell("row", row=self.row)
         return self.row
+
+    def check_budget(self) -> None:
+        if self.steps >= self.config.steps:
+            raise InputError(f"the budget of {self.config.steps} steps is spent: give more steps to go on")
 
     def counts(self) -> dict:
         """Steps so far, and %Cov: units visited, of those of full coverage where these are known (5; S5-03)."""
@@ -834,7 +837,8 @@ class Baseline:
     """What the compared methods share with RbExplore: one step counter, one coverage (R2, R25), seeds by purpose, and the
     interface that the run folder uses. A subclass has advance(): spend the steps of one iteration, and learn from them."""
 
-    run, seed, rng, counts, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, RbExplore.counts, "explore"
+    run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
+    counts, check_budget = RbExplore.counts, RbExplore.check_budget
 
     def __init__(self, env_fn: Callable, config: Config):
         self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
@@ -846,6 +850,7 @@ class Baseline:
 
     def iterate(self) -> dict:
         """One iteration. Returns its metrics."""
+        self.check_budget()
         self.iteration += 1
         self.row = {"iteration": self.iteration, "phase": self.phase}
         self.tell("iteration", **self.row)
@@ -909,7 +914,7 @@ class PPOConfig:
 
 
 # The maze's: 8 actors, so that 100,000 steps make 97 updates and not 6, each of which then has to count; one frame shows all
-# that four would; the longest way from the start is 61 steps.
+# that four would; no state of level 1 is more than 86 steps from the start.
 PPO_CONFIGS = {"paper": PPOConfig(), "maze": PPOConfig(actors=8, episode_steps=150, stack=1, learning_rate=1e-3, standardise=True,
                                                        bonus_share=1.0, hidden=128)}
 
@@ -1426,7 +1431,7 @@ def curves_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], fu
         axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
     if pretraining:
         axes.axvspan(0, pretraining, color="0.9", label="pretraining")
-    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, grid[-1]), ylim=(0, 102 if full else None),
+    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, max(1, grid[-1])), ylim=(0, 102 if full else None),
              ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered")
     axes.legend()
     return figure
