@@ -1431,8 +1431,8 @@ def curves_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], fu
         axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
     if pretraining:
         axes.axvspan(0, pretraining, color="0.9", label="pretraining")
-    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, max(1, grid[-1])), ylim=(0, 102 if full else None),
-             ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered")
+    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, max(1, grid[-1])),
+             ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered", ylim=(0, 102 if full else None))
     axes.legend()
     return figure
 
