@@ -1659,8 +1659,11 @@ def test_a_run_is_not_overwritten_nor_resumed_as_another(finished, tmp_path, cap
         check_refused(capsys, tmp_path, ["--resume", here], "missing or damaged")
     (tmp_path / "checkpoint.pt").write_bytes(whole)
     text = (tmp_path / "config.json").read_text()
-    (tmp_path / "config.json").write_text(text.replace('"beta": 1.0', '"beta": 2.0'))
-    check_refused(capsys, tmp_path, ["--resume", here], "another configuration")
+    changes = ('"beta": 1.0', '"beta": 2.0'), ('"options": {', '"options": {"level": 2,'), ('"gamma": 0.99', '"gamma": 0.9')
+    for old, new in changes:
+        assert old in text
+        (tmp_path / "config.json").write_text(text.replace(old, new))
+        check_refused(capsys, tmp_path, ["--resume", here], "another configuration")
     (tmp_path / "config.json").write_text(text.replace('"beta"', '"alpha"'))
     check_refused(capsys, tmp_path, ["--resume", here], "does not fit this version")
     (tmp_path / "file").write_text("")
