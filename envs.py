@@ -3,7 +3,6 @@
 Exploring with rollbacks asks two things of an environment beyond Gymnasium's interface: take a snapshot of the complete state,
 and restore it. Coverage units (paper 5) are for metrics and figures only."""
 
-import functools
 import gzip
 import inspect
 import tempfile
@@ -141,7 +140,7 @@ class Maze(PersistentEnv):
         self.start = self.state = (*start, 1, 0, 0)  # x, y, facing right, plates pressed as bits, dead
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._seen = functools.lru_cache(4096)(self._draw)  # frames of the states met lately
+        self._seen: dict[tuple, np.ndarray] = {}  # frames of the states met lately
         self.full_coverage = len(self.reachable())
 
     def reset(self, *, seed=None, options=None):
@@ -175,7 +174,7 @@ class Maze(PersistentEnv):
 
     def render(self) -> np.ndarray | None:
         """The room in which the agent is, (360, 360, 3) uint8; None without a render_mode."""
-        return None if self.render_mode is None else self._picture(self.state, 36, 120)
+        return None if self.render_mode is None else self._picture(36, 120)
 
     def reachable(self) -> set[tuple[int, int, int]]:
         """Every unit in which the agent can stand alive, by breadth-first search over the full states."""
@@ -247,19 +246,19 @@ class Maze(PersistentEnv):
         return y // ROWS * self.across + x // COLUMNS
 
     def _frame(self) -> np.ndarray:
-        return self._seen(self.state).copy()
-
-    def _draw(self, state: tuple) -> np.ndarray:
         """The observation: luminance, in whole numbers so that every machine agrees, centred on black."""
-        size, frame = self.frame_size, np.zeros((self.frame_size, self.frame_size), np.uint8)
-        picture = self._picture(state, size // COLUMNS, size // ROWS)
-        top, left = ((size - side) // 2 for side in picture.shape[:2])
-        frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.astype(np.uint32) @ LUMINANCE >> 8
-        return frame
+        if self.state not in self._seen:
+            self._seen = self._seen if len(self._seen) < 4096 else {}
+            size, frame = self.frame_size, np.zeros((self.frame_size, self.frame_size), np.uint8)
+            picture = self._picture(size // COLUMNS, size // ROWS)
+            top, left = ((size - side) // 2 for side in picture.shape[:2])
+            frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.astype(np.uint32) @ LUMINANCE >> 8
+            self._seen[self.state] = frame
+        return self._seen[self.state].copy()
 
-    def _picture(self, state: tuple, w: int, h: int) -> np.ndarray:
+    def _picture(self, w: int, h: int) -> np.ndarray:
         """The room with the agent, (3 h, 10 w, 3) uint8."""
-        x, y, facing, plates, dead = state
+        x, y, facing, plates, dead = self.state
         picture = self._paint_room(self._room(x, y), plates, w, h)
         paint_agent(picture[y % ROWS * h :, x % COLUMNS * w :][:h, :w], facing, dead)
         return picture

@@ -15,6 +15,7 @@ import math
 import multiprocessing
 import os
 import pathlib
+import pickle
 import random
 import re
 import shutil
@@ -1763,6 +1764,12 @@ def test_a_deep_fall_kills_unless_the_agent_lets_itself_down(monkeypatch):
     assert env.step(2)[2] and env.unit() is None
     env.reset()
     assert not env.step(4)[2] and env.unit() == (0, 1, 2)
+
+
+def test_a_maze_can_be_copied_to_another_process():
+    env = Maze()
+    env.restore(bytes((1, 15, 5, 1, 1, 0)))
+    assert pickle.loads(pickle.dumps(env)).step(5)[0].tobytes() == env.step(5)[0].tobytes()
 
 
 def test_dead_agents_stand_nowhere_and_gates_show_their_state():
