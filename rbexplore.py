@@ -1433,7 +1433,7 @@ def curves_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], fu
         axes.axvspan(0, pretraining, color="0.9", label="pretraining")
     axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, max(1, grid[-1])),
              ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered", ylim=(0, 102 if full else None))
-    axes.legend()
+    axes.legend(loc="lower right" if len(curves) == 1 else "best")
     return figure
 
 
