@@ -989,7 +989,7 @@ def test_S3_2_03_in_a_whole_run_the_stored_actions_lead_to_every_centre(env_fn):
 
 
 def test_S4_01_S6_1_06_S6_1_11_M_trajectories_from_the_sampled_centres_within_the_cap(monkeypatch):
-    a, tape = explorer()
+    a, tape = explorer(replace(QUICK, merge_every=2))
     explore, seen = a.explore, []
 
     def noted():
@@ -1010,6 +1010,7 @@ def test_S4_01_S6_1_06_S6_1_11_M_trajectories_from_the_sampled_centres_within_th
             full += len(tau.units) == a.config.trajectory_steps
     assert full > 5 and max(len(set(sample["chosen"])) for sample in tape.of("sample")) > 2
     assert a.exploration_steps == sum(len(tau.units) for *_, taus in seen for tau in taus) < a.steps
+    assert any(row["merged"] for row in tape.rows()[:-1])
     made = 0
     for event, data in tape.events:
         made += len(data.get("made", ()))
