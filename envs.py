@@ -127,7 +127,7 @@ class Maze(PersistentEnv):
 
     def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
         if level not in tuple(LEVELS):  # a tuple, since a list cannot be looked up in a dict
-            raise InputError(f"unknown maze level {level!r}: there are 1, 2 and 3")
+            raise InputError(f"unknown maze level {level!r}: there are {', '.join(map(str, sorted(LEVELS)))}")
         if not isinstance(frame_size, int) or frame_size < 32:
             raise InputError(f"frame_size must be a whole number of pixels, 32 or more, and not {frame_size!r}")
         if render_mode not in (None, "rgb_array"):
@@ -170,7 +170,7 @@ class Maze(PersistentEnv):
     def unit(self) -> tuple[int, int, int] | None:
         """(room, column, row) of the living agent, None of a dead one."""
         x, y, *_, dead = self.state
-        return None if dead else (self._room(x, y), x % COLUMNS, y % ROWS)
+        return None if dead else self._place(x, y)
 
     def render(self) -> np.ndarray | None:
         """The room in which the agent is, (360, 360, 3) uint8; None without a render_mode."""
@@ -178,7 +178,7 @@ class Maze(PersistentEnv):
 
     def reachable(self) -> set[tuple[int, int, int]]:
         """Every unit in which the agent can stand alive, by breadth-first search over the full states."""
-        return {(self._room(x, y), x % COLUMNS, y % ROWS) for x, y, *_, dead in self._search(self.start) if not dead}
+        return {self._place(x, y) for x, y, *_, dead in self._search(self.start) if not dead}
 
     def distances(self, snapshot: bytes) -> dict[bytes, int]:
         """Steps from the state of `snapshot` to every full state that follows from it, dead ones too, by snapshot."""
@@ -242,8 +242,8 @@ class Maze(PersistentEnv):
                 return state
         raise InputError(f"no snapshot of maze level {self.level}: {snapshot!r:.60}")
 
-    def _room(self, x: int, y: int) -> int:
-        return y // ROWS * self.across + x // COLUMNS
+    def _place(self, x: int, y: int) -> tuple[int, int, int]:
+        return y // ROWS * self.across + x // COLUMNS, x % COLUMNS, y % ROWS  # room, column, row
 
     def _frame(self) -> np.ndarray:
         """The observation: luminance, in whole numbers so that every machine agrees, centred on black."""
@@ -259,8 +259,9 @@ class Maze(PersistentEnv):
     def _picture(self, w: int, h: int) -> np.ndarray:
         """The room with the agent, (3 h, 10 w, 3) uint8."""
         x, y, facing, plates, dead = self.state
-        picture = self._paint_room(self._room(x, y), plates, w, h)
-        paint_agent(picture[y % ROWS * h :, x % COLUMNS * w :][:h, :w], facing, dead)
+        room, column, row = self._place(x, y)
+        picture = self._paint_room(room, plates, w, h)
+        paint_agent(picture[row * h :, column * w :][:h, :w], facing, dead)
         return picture
 
     def _paint_room(self, room: int, plates: int, w: int, h: int) -> np.ndarray:
@@ -305,7 +306,7 @@ FRAMESKIP = 4  # emulator frames a step (6.1)
 
 
 def _overlaps(pixels: int, size: int) -> np.ndarray:
-    """(size, pixels): how much of each pixel lies in each of `size` equal parts; `size` is a whole pixel."""
+    """(size, pixels): how much of each pixel, in 1/size of it, lies in each of `size` equal parts."""
     part, pixel = np.arange(size)[:, None] * pixels, np.arange(pixels) * size
     return (np.minimum(part + pixels, pixel + size) - np.maximum(part, pixel)).clip(0).astype(float)
 
@@ -329,7 +330,7 @@ class EmulatorEnv(PersistentEnv):
         self._start = self.snapshot()
 
     def _observe(self) -> np.ndarray:
-        luma = self._screen().astype(np.float32) @ np.float32([299, 587, 114])  # (H, W), whole numbers
+        luma = self._screen().astype(np.float32) @ np.float32([299, 587, 114])  # (H, W)
         down, across = (_overlaps(pixels, self.observation_space.shape[0]) for pixels in luma.shape)
         return (down @ np.rint(luma / 1000) @ across.T // luma.size).astype(np.uint8)  # whole numbers: exact everywhere
 

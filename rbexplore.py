@@ -1416,6 +1416,12 @@ def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
     return np.full((rows * height * side, across * width * side, 3), 40, np.uint8), boxes, labels
 
 
+def steps_to(times: list[int], full: int) -> dict[int, str | None]:
+    """Per cent of full coverage -> the step that reached it, if one did; times: of the first visits, sorted."""
+    needed = {share: math.ceil(full * share / 100) for share in (50, 90, 100)}
+    return {share: f"{times[k - 1]:,}" if len(times) >= k else None for share, k in needed.items()}
+
+
 def coverage_curve(discovered: dict[tuple, int], grid: np.ndarray, full: int | None) -> np.ndarray:
     """Coverage after each number of steps of the grid: %, or units where full coverage is not known."""
     return np.searchsorted(sorted(discovered.values()), grid, "right") * (100 / full if full else 1)
@@ -1655,9 +1661,7 @@ def experiment(args: argparse.Namespace) -> int:
         found[variant, seed] = {tuple(unit): step for unit, step in state["discovered"]}
         times = sorted(found[variant, seed].values())
         curves.setdefault(variant, {})[seed] = coverage_curve(found[variant, seed], grid, full)
-        needed = [math.ceil(p * (full or 0) / 100) for p in (50, 90, 100)]
-        marks = ", ".join(f"{times[k - 1]:,}" if len(times) >= k else "-" for k in needed)
-        unit = f"%; steps to 50, 90, 100 %: {marks}" if full else "units"
+        unit = f"%; steps to 50, 90, 100 %: {', '.join(s or '-' for s in steps_to(times, full).values())}" if full else "units"
         print(f"{variant:18} seed {seed}: {curves[variant][seed][-1]:6.1f} {unit}")
     rows = [f"{v},{n},{x},{y:.4f}" for v, of in curves.items() for n, ys in of.items() for x, y in zip(grid, ys, strict=True)]
     write_atomically(out / "curves.csv", lambda f: f.write("\n".join(["variant,seed,steps,coverage", *rows, ""]).encode()))
@@ -1871,9 +1875,8 @@ def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
     if not isinstance(a, Baseline):
         lines[0] += f", {len(a.graph.clusters)} clusters"
     if full:
-        marks = [(share, math.ceil(full * share / 100)) for share in (50, 90, 100)]
-        lines.append("steps to " + ", ".join(f"{share} %: {times[k - 1]:,}" if len(times) >= k else f"{share} %: not reached"
-                                             for share, k in marks))
+        marks = steps_to(times, full).items()
+        lines.append("steps to " + ", ".join(f"{share} %: {step or 'not reached'}" for share, step in marks))
     if resource:
         unit = 2**30 if sys.platform == "darwin" else 2**20  # it counts bytes there, elsewhere kilobytes
         lines[0] += f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.2f} GiB"

@@ -1274,12 +1274,13 @@ def test_S6_3_03_only_theta_merge_differs(monkeypatch):
     for theta in (0.25, 0.5, 0.75):
         given = settings("--theta-merge", str(theta))["config"]
         assert given == plain | {"theta_merge": theta}
-        a, tape = explorer(replace(QUICK, pretrain_steps=0, theta_merge=theta, steps=300, merge_every=1))
+        a, tape = explorer(replace(QUICK, pretrain_steps=0, theta_merge=theta, steps=900, merge_every=1))
         tape.wrap(monkeypatch, a.graph, "merge", note=lambda R, threshold: threshold)
         a.phase = "explore"
         tape.wrap(monkeypatch, a.graph, "add_trajectory", note=lambda tau, R, threshold: threshold)
         a.run()
         assert set(tape.noted("merge")) == {theta} and set(tape.noted("add_trajectory")) == {0.5}
+        assert sum(row["added"] for row in tape.rows()) > 3  # there is something to merge
 
 
 # ------------------------------------------------------------------------------------- the same run, however it is run
