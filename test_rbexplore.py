@@ -2467,6 +2467,11 @@ def test_methods_resume_as_if_never_interrupted(method):
     assert b.row == whole.row and b.discovered == whole.discovered
 
 
+def test_steps_to_a_share_of_full_coverage():
+    assert rb.steps_to([10, 20, 1300, 1400], 4) == {50: "20", 90: "1,400", 100: "1,400"}
+    assert rb.steps_to([10, 20], 3) == {50: "20", 90: None, 100: None}
+
+
 def test_S6_2_05_band_is_min_to_max_and_S6_2_06_best_is_by_final_coverage():
     grid, curves = np.array([0, 5, 10]), {0: np.array([0.0, 9, 10]), 1: np.array([0.0, 1, 12]), 2: np.array([0.0, 2, 5])}
     (axes,) = rb.curves_figure(grid, {"rnd": curves}, 100, "tiles").axes
