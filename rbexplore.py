@@ -839,6 +839,7 @@ class Baseline:
 
     run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
     counts, check_budget = RbExplore.counts, RbExplore.check_budget
+    parts, moments = (), ()  # networks and optimisers, and statistics, which a checkpoint keeps
 
     def __init__(self, env_fn: Callable, config: Config):
         self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
@@ -866,15 +867,6 @@ class Baseline:
         if unit is not None:
             self.discovered.setdefault(unit_key(unit), self.steps)
         return frame, terminated, truncated
-
-    def state(self) -> dict:
-        """All that the method needs to go on, as tensors, numbers and strings (bytes as hex)."""
-        return {"counters": [self.iteration, self.steps, self.exploration_steps],
-                "discovered": [(list(unit), step) for unit, step in self.discovered.items()]}
-
-    def load(self, state: dict) -> None:
-        self.iteration, self.steps, self.exploration_steps = state["counters"]
-        self.discovered = {tuple(unit): step for unit, step in state["discovered"]}
 
 
 class Random(Baseline):
@@ -1090,22 +1082,6 @@ class PPO(Baseline):
         finite(loss, "PPO")
         return {"value_loss": value_loss.item(), "entropy": entropy.item()}
 
-    def state(self) -> dict:
-        tensor = torch.as_tensor
-        return super().state() | {
-            "networks": [part.state_dict() for part in self.parts],
-            "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in self.moments],
-            "actors": [[x.hex() for x in self.snapshots], tensor(self.seen), tensor(self.ages), tensor(self.sums)]}
-
-    def load(self, state: dict) -> None:
-        super().load(state)
-        for part, saved in zip(self.parts, state["networks"], strict=True):
-            part.load_state_dict(saved)
-        for m, (count, mean, m2) in zip(self.moments, state["moments"], strict=True):
-            m.count, m.mean, m.m2 = count, mean.cpu().numpy(), m2.cpu().numpy()
-        snapshots, *rest = state["actors"]
-        self.snapshots, (self.seen, self.ages, self.sums) = list(map(bytes.fromhex, snapshots)), (x.cpu().numpy() for x in rest)
-
 
 class Cells(nn.Module):
     """Cells in R's place: 1 for states of one cell, else 0. embed: frames (T, H, W) uint8 -> cells (T, d)."""
@@ -1173,25 +1149,33 @@ METRICS = ("iteration", "phase", "steps", "exploration_steps", "coverage", "unit
 # --------------------------------------------------------------------------------------- the state of a run, as plain data
 
 
-def stateful(a: RbExplore) -> tuple:
-    return a.similarity, a.similarity.optimiser, a.novelty.target, a.novelty.predictor, a.novelty.optimiser
+def kept(a: RbExplore | Baseline) -> tuple[tuple, tuple]:
+    """The networks and optimisers of a method, and its statistics."""
+    if isinstance(a, Baseline):
+        return a.parts, a.moments
+    r, rnd = a.similarity, a.novelty
+    return (r, r.optimiser, rnd.target, rnd.predictor, rnd.optimiser), (rnd.pixels, *rnd.errors)
 
 
-def pack(a: RbExplore) -> dict:
+def pack(a: RbExplore | Baseline) -> dict:
     """All that a run needs to go on, as tensors, numbers and strings (bytes as hex), which load without unpickling objects.
     There is no generator in it: each is made from the seed, the iteration and a purpose."""
+    tensor, (parts, moments) = torch.as_tensor, kept(a)
+    state = {
+        "counters": [a.phase, a.iteration, a.steps, a.exploration_steps],
+        "discovered": [(list(unit), step) for unit, step in a.discovered.items()],
+        "networks": [part.state_dict() for part in parts],
+        "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in moments],
+    }
+    if isinstance(a, PPO):
+        state["actors"] = [[x.hex() for x in a.snapshots], tensor(a.seen), tensor(a.ages), tensor(a.sums)]
     if isinstance(a, Baseline):
-        return a.state()
+        return state
     number: dict[Path, int] = {}  # each path once, parents first
     for v in a.graph.clusters.values():
         for link in v.path.chain():
             number.setdefault(link, len(number))
-    tensor = torch.as_tensor
-    return {
-        "counters": [a.phase, a.iteration, a.steps, a.exploration_steps],
-        "discovered": [(list(unit), step) for unit, step in a.discovered.items()],
-        "networks": [part.state_dict() for part in stateful(a)],
-        "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in (a.novelty.pixels, *a.novelty.errors)],
+    return state | {
         "buffer": [snapshot.hex() for snapshot in a.novel],
         "replay": [(tensor(np.stack(p.states)), tensor(p.index), tensor(p.y), dict(p.counts)) for p in a.replay],
         "paths": [(number.get(p.parent, -1), tensor(p.frames), [x.hex() for x in p.actions]) for p in number],
@@ -1201,20 +1185,22 @@ def pack(a: RbExplore) -> dict:
     }
 
 
-def unpack(a: RbExplore, state: dict) -> None:
+def unpack(a: RbExplore | Baseline, state: dict) -> None:
     """Put a packed state into an algorithm of the same configuration."""
-    if isinstance(a, Baseline):
-        return a.load(state)
     a.phase, a.iteration, a.steps, a.exploration_steps = state["counters"]
     a.discovered = {tuple(unit): step for unit, step in state["discovered"]}
-    for part, saved in zip(stateful(a), state["networks"], strict=True):
+    if isinstance(a, RbExplore):
+        a.novelty.errors = deque((Moments() for _ in state["moments"][1:]), a.config.novelty_window)
+    parts, moments = kept(a)
+    for part, saved in zip(parts, state["networks"], strict=True):
         part.load_state_dict(saved)
-    moments = []
-    for count, mean, m2 in state["moments"]:
-        moments.append(Moments())
-        moments[-1].count, moments[-1].mean, moments[-1].m2 = count, mean.numpy(), m2.numpy()
-    a.novelty.pixels = moments[0]
-    a.novelty.errors = deque(moments[1:], a.config.novelty_window)
+    for m, (count, mean, m2) in zip(moments, state["moments"], strict=True):
+        m.count, m.mean, m.m2 = count, mean.numpy(), m2.numpy()
+    if isinstance(a, PPO):
+        snapshots, *rest = state["actors"]
+        a.snapshots, (a.seen, a.ages, a.sums) = list(map(bytes.fromhex, snapshots)), (x.numpy() for x in rest)
+    if isinstance(a, Baseline):
+        return
     a.novel = [bytes.fromhex(x) for x in state["buffer"]]
     replay = [Pairs(list(s.numpy()), index.numpy(), y.numpy(), Counter(c)) for s, index, y, c in state["replay"]]
     a.replay = deque(replay, a.config.replay_iterations)
