@@ -1229,13 +1229,23 @@ def memory(a: RbExplore) -> float:
 
 
 def write_atomically(path: pathlib.Path, write: Callable) -> None:
-    """A reader finds the old file or the new one and never half of one, also after a kill."""
+    """A reader finds the old file or the new one and never half of one, also after a kill. InputError where that fails."""
     temporary = path.with_name(path.name + ".new")
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}; make room, or choose another place") from None
+
+
+def make_folder(folder: pathlib.Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written: {error.strerror}; choose another folder with --out") from None
 
 
 class Run:
@@ -1251,12 +1261,9 @@ class Run:
         """Begin in a folder that holds no run yet."""
         if (self.folder / "config.json").exists():
             raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
-            write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
-        except OSError as error:
-            raise InputError(f"{self.folder} cannot be written: {error.strerror}; choose another folder with --out") from None
+        make_folder(self.folder)
+        self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
+        write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
 
     def load(self) -> None:
         """Take the state of the last complete iteration from the checkpoint; writes nothing."""
@@ -1612,13 +1619,14 @@ def execute(command: list[str]) -> str:
     """Run it in a process of its own, or go on where it was interrupted, or find it finished. Returns what was done."""
     folder, settings = pathlib.Path(command[-1]), settings_of(parser().parse_args(command))
     if (folder / "config.json").exists():
-        if json.loads((folder / "config.json").read_text()) | {"versions": 0} != settings | {"versions": 0}:
+        free = {"versions": 0, "workers": 0}  # may differ
+        if recorded_settings(str(folder), parser().parse_args([])) | free != settings | free:
             raise InputError(f"{folder} holds a run of another configuration: choose another --out")
         with open(folder / "metrics.csv") as file:
             if max((int(row["steps"]) for row in csv.DictReader(file)), default=0) >= settings["config"]["steps"]:
                 return f"{folder} was finished"
-        command = ["--resume", str(folder), "--no-figures"]
-    folder.mkdir(parents=True, exist_ok=True)
+        command = ["--resume", str(folder), "--no-figures", "--workers", str(settings["workers"])]
+    make_folder(folder)
     with open(folder / "log.txt", "a") as log:
         code = subprocess.run([sys.executable, __file__, *command], stdout=log, stderr=log).returncode
     if code:
@@ -1798,20 +1806,22 @@ def command(args: argparse.Namespace) -> int:
         raise InputError("--experiment, --resume and --verify exclude each other: give one of them")
     if args.export_demos and not args.verify:
         raise InputError("--export-demos goes with --verify RUN")
+    if args.experiment and (args.trace or args.profile):
+        raise InputError("--trace and --profile go with a single run, not with --experiment: leave them out")
+    if not args.no_figures and not args.verify:
+        new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
     if args.experiment:
         return experiment(args)
     old = args.resume or args.verify
     settings = recorded_settings(old, args) if old else settings_of(args)
-    if not args.no_figures and not args.verify:
-        new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
     started = time.monotonic()
     algorithm, executor = prepare(settings)
     folder = pathlib.Path(old or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
     run = Run(folder, settings, algorithm, args.trace or (folder / "trace.jsonl").exists())
     if args.verify:
         return verified(run, args.export_demos)
+    profile = Profile(algorithm, run) if args.profile else None  # which may refuse, before there is a folder
     run.resume() if args.resume else run.create()
-    profile = Profile(algorithm, run) if args.profile else None
     print(header(run))
     stopped = False
     try:

@@ -824,6 +824,43 @@ def test_S4_2_24_to_29_assignment_and_merge_against_the_slow_version(theta, thet
     assert merged > 40
 
 
+def test_R17_every_pair_of_the_larger_class_can_be_drawn():
+    pairs, rng = Pairs(y=np.array([1] * 30 + [0] * 12)), np.random.default_rng(0)
+    assert {int(k) for _ in range(50) for k in pairs.balanced(rng)} == set(range(42))
+
+
+def test_rates_are_of_as_many_pairs_as_the_smaller_class_has(monkeypatch):
+    model, y, scored = SimilarityModel(MAZE, (32, 32)), np.array([1] * 30 + [0] * 12), []
+    monkeypatch.setattr(model, "score", lambda first, second: scored.append(len(first)) or np.ones(len(first)))
+    model.rates(Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y), np.random.default_rng(0))
+    assert scored == [24]
+
+
+def test_R18_the_gradient_is_clipped_before_the_step():
+    model, x = SimilarityModel(MAZE, (32, 32)), pictures(16)
+    model.train().update(x[:8], x[8:], np.arange(8) % 2, 1e-3)
+    assert math.sqrt(sum(s["exp_avg"].square().sum().item() for s in model.optimiser.state.values())) < 1.001e-4
+
+
+def test_R18_R20_widths_are_those_of_the_configuration():
+    head = SimilarityModel(replace(MAZE, embedding=8, head_width=24), (32, 32)).head
+    assert [m.in_features for m in head if isinstance(m, nn.Linear)] == [16, 24, 24, 24]
+    rnd, x = RND(replace(MAZE, rnd_features=24), (32, 32)), torch.zeros(1, 1, 32, 32)
+    assert rnd.target(x).shape == rnd.predictor(x).shape == (1, 24)
+
+
+def test_each_seed_makes_other_networks_and_the_predictor_is_not_the_target():
+    one, other = ((SimilarityModel(c, (32, 32)), RND(c, (32, 32))) for c in (replace(MAZE, seed=seed) for seed in (0, 1)))
+    assert weights(one[0]) != weights(other[0]) and weights(one[1].target) != weights(other[1].target)
+    assert weights(one[1].target) != weights(one[1].predictor[0])
+
+
+def test_a_prefix_does_not_keep_its_whole_trajectory_in_memory():
+    t, (graph, stub) = tau(list(range(0, 400, 10))), grow([])
+    graph.add_trajectory(t, stub, 0.5)
+    assert all(v.path.frames.base is None for v in list(graph.clusters.values())[1:])
+
+
 # ------------------------------------------------------------ the loop, the run folder, the environments
 
 TINY = replace(MAZE, steps=4000, pretrain_steps=600, M=4, L=3, trajectory_steps=60, additional_steps=40, merge_every=3)
@@ -1108,6 +1145,53 @@ def test_S4_07_rewards_change_nothing():
         a.run()
     assert all(tape.rows() == runs[0][1].rows() and graph_of(a) == graph_of(runs[0][0]) for a, tape in runs[1:])
     assert len(runs[0][0].graph.clusters) > 3
+
+
+def test_each_purpose_of_each_iteration_has_seeds_of_its_own():
+    a, seeds = explorer()[0], set()
+    for a.iteration in range(3):
+        seeds |= {tuple(a.seed(purpose, k)) for purpose in rbexplore.PURPOSES for k in (-1, 0, 1)}
+    assert len(seeds) == 3 * 3 * len(rbexplore.PURPOSES)
+
+
+def test_a_seeded_environment_begins_where_the_seed_says():
+    class Seeded(Grid):
+        home = (0, 0)
+
+        def reset(self, *, seed=None, options=None):
+            self.place = self.home = self.home if seed is None else (seed, 0)
+            return self.frame(), {}
+    assert explorer(env_fn=Seeded, seed=3)[0].snap_init == bytes((3, 0))
+    assert make_method("random", Seeded, replace(QUICK, seed=3)).snap_init == bytes((3, 0))
+
+
+def test_R19_rates_are_of_pairs_that_R_has_not_trained_on(monkeypatch):
+    (a, tape), given = explorer(replace(QUICK, replay_iterations=1), MAZE_FN), []
+    tape.wrap(monkeypatch, a, "train_similarity", note=given.append)
+    tape.wrap(monkeypatch, a.similarity, "rates", note=lambda pairs, *_: pairs)
+    for _ in range(3):
+        a.iterate()
+    assert all(x is y for x, y in zip(tape.noted("rates"), given, strict=True))
+
+
+def test_units_become_plain_keys():
+    assert [rbexplore.unit_key(u) for u in (5, "hall", [1, 2], (3,))] == [(5,), ("hall",), (1, 2), (3,)]
+    assert {type(x) for x in rbexplore.unit_key(np.array([1, 2]))} == {int}
+
+
+def test_a_worker_resets_its_environment_before_the_first_job():
+    class Fresh(Grid):
+        ready = False
+
+        def reset(self, **named):
+            self.ready = True
+            return super().reset(**named)
+
+        def restore(self, snapshot):
+            assert self.ready
+            return super().restore(snapshot)
+    with ThreadPoolExecutor(1) as pool:
+        explorer(env_fn=Fresh, executor=pool)[0].iterate()
 
 
 # ------------------------------------------------------------------------------ the domain and the experiments (5, 6)
@@ -1697,6 +1781,87 @@ def test_a_learning_rate_without_bounds_stops_the_run(tmp_path, capsys):
     assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["rows"] == []
 
 
+def test_a_configuration_refuses_wrong_types_and_choices():
+    for wrong, said in (({"M": True}, "type int"), ({"rnd_encoder": "big"}, "choose nature or small")):
+        with pytest.raises(InputError, match=said):
+            replace(MAZE, **wrong)
+
+
+def test_what_the_command_line_makes_of_ppo_and_of_paths():
+    for base in ("maze", "paper"):
+        assert settings("--method", "rnd", "--config", base)["ppo"] == asdict(PPO_CONFIGS[base])
+    assert settings("--gamma", "0.9", "--episodic")["ppo"] == asdict(replace(PPO_CONFIGS["maze"], gamma=0.9, episodic=True))
+    assert settings("--env", "pop", "--rom", "x", "--state", "y")["options"] == {
+        "rom": os.path.abspath("x"), "state": os.path.abspath("y"), "frame_size": 96}
+
+
+@pytest.mark.parametrize("argv, said", [
+    ("--resume {0} --no-figures --gamma 0.9", "keeps its options"), ("--resume {0} --verify {0}", "exclude each other"),
+    ("--export-demos x.npz", "goes with"), ("--verify {0} --export-demos {1}/none/x.npz", "cannot be written"),
+    ("--method cells --profile --no-figures --out {1}/run", "--profile is for"),
+    ("--workers 2 --profile --no-figures --out {1}/run", "--profile is for"),
+    ("--experiment ablation --trace --out {1}/run", "single run"),
+    ("--experiment ablation --profile --out {1}/run", "single run")])
+def test_options_that_do_not_go_together(finished, tmp_path, capsys, argv, said):
+    check_refused(capsys, tmp_path, argv.format(finished, tmp_path).split(), said)
+
+
+def test_a_resumed_run_may_have_other_workers_and_a_verified_one_another_device(finished, tmp_path):
+    line = parser().parse_args(["--resume", str(finished), "--workers", "2"])
+    assert rbexplore.recorded_settings(str(finished), line)["workers"] == 2
+    folder = shutil.copytree(finished, tmp_path / "run")
+    text = (folder / "config.json").read_text().replace('"device": "cpu"', '"device": "cuda:7"')
+    (folder / "config.json").write_text(text)
+    assert main(["--verify", str(folder), "--device", "cpu"]) == 0
+
+
+def test_a_trace_goes_on_at_a_resume_that_does_not_ask_for_it(tmp_path):
+    inner = RbExplore.train_novelty
+
+    def interrupted(self, trajectories):
+        if self.iteration == 2:
+            raise KeyboardInterrupt
+        inner(self, trajectories)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RbExplore, "train_novelty", interrupted)
+        assert main(["--method", "cells", "--trace", "--no-figures", "--steps", "9000", "--out", str(tmp_path / "c")]) == 130
+    assert main(["--resume", str(tmp_path / "c"), "--no-figures"]) == 0
+    events = [json.loads(line) for line in (tmp_path / "c" / "trace.jsonl").read_text().splitlines()]
+    assert [e["iteration"] for e in events if e["event"] == "iteration"] == list(range(1, len(metrics(tmp_path / "c")) + 1))
+
+
+@pytest.mark.parametrize("write", [1, 2, 3])
+def test_a_run_killed_while_it_is_made_leaves_a_folder_that_can_be_used(tmp_path, monkeypatch, write):
+    replaced, line = itertools.count(1), ["--method", "random", "--steps", "2000", "--no-figures", "--out", str(tmp_path / "run")]
+
+    def crash(old, new, inner=os.replace):
+        if next(replaced) == write:
+            raise SystemExit("killed")
+        inner(old, new)
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(rbexplore.os, "replace", crash)
+        main(line)
+    assert main(line) == 0
+
+
+def test_seconds_are_those_of_an_iteration(tmp_path):
+    began = time.monotonic()
+    assert main([*TINY_RUN, "--no-figures", "--steps", "2000", "--out", str(tmp_path)]) == 0
+    seconds = [float(row[-1]) for row in metrics(tmp_path, leave=())]
+    assert len(seconds) > 4 and 0 < sum(seconds) < time.monotonic() - began + 0.1
+
+
+def test_a_warning_names_its_cause(tmp_path, capsys):
+    run = rbexplore.Run(tmp_path, settings(), explorer(env_fn=MAZE_FN)[0])
+    for low, what in (("r_true_positive", "new"), ("r_true_negative", "known")):
+        row = {"iteration": 1, "phase": "explore", "steps": 9, "coverage": 0.1, "units": 3, "seconds": 1.0,
+               "r_true_positive": 0.9, "r_true_negative": 0.9} | {low: 0.1}
+        run.rows = [row]
+        run.show(row)
+        out = capsys.readouterr().out
+        assert out.count("warning") == 1 and f"every state {what}" in out
+
+
 # ----------------------------------------------------------------------------------------------------------- the maze
 
 
@@ -1800,6 +1965,51 @@ def test_the_maze_refuses_what_it_cannot_do():
     env.restore(next(s for s in env.distances(env.snapshot()) if s[-1]))  # a state of death
     with pytest.raises(InputError, match="dead"):
         env.step(0)
+
+
+def test_nothing_moves_where_there_is_no_edge_and_nothing_to_climb_to(monkeypatch):
+    monkeypatch.setitem(LEVELS, 4, "    #..#######\n    #@_#######\n    ##########")
+    for env, action in ((Maze(), envs.DOWN), (Maze(4), envs.UP)):
+        before = env.snapshot()
+        env.step(action)
+        assert env.snapshot() == before
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_level_map_has_rooms_and_boxes_in_their_places(level):
+    env = Maze(level)
+    (picture, boxes), across = env.level_map(), len(env.tiles[0]) // 10
+    for (room, column, row), (x, y, w, h) in boxes.items():
+        assert (x // 8, y // 24, w, h) == (room % across * 10 + column, room // across * 3 + row, 8, 24)
+    for y, line in enumerate(env.tiles):
+        for x, tile in enumerate(line):
+            assert (tuple(picture[24 * y + 23, 8 * x]) == envs.STONE) == (tile == "#"), (x, y)
+
+
+def test_frames_show_plates_spikes_and_the_dead_and_rooms_look_different():
+    env, bare = Maze(), Maze()
+    for k, plate in enumerate(env.letters):
+        ((x, y),) = [(x, y) for y, line in enumerate(env.tiles) for x, tile in enumerate(line) if tile == plate]
+        beside = next(x + d for d in (1, -1) if env.tiles[y][x + d] in "_@" and (x + d) // 10 == x // 10)
+        up, sunk = (env.restore(bytes((1, beside, y, 1, plates, 0))) for plates in (0, 1 << k))
+        assert not np.array_equal(up, sunk), plate
+    dead = next(s for s in env.distances(env.snapshot()) if s[-1])
+    assert not np.array_equal(env.restore(dead), env.restore(dead[:-1] + b"\0"))
+    y, x = next((y, line.index("^")) for y, line in enumerate(env.tiles) if "^" in line)
+    bare.tiles, room = [line.replace("^", "_") for line in env.tiles], y // 3 * env.across + x // 10
+    assert not np.array_equal(env._paint_room(room, 0, 8, 24), bare._paint_room(room, 0, 8, 24))
+    bare.tiles = ["".join("#" if k % 10 in (0, 9) else "_" for k in range(30))] * 9
+    assert len({bare._paint_room(k, 0, 8, 24).tobytes() for k in range(9)}) == 9
+
+
+def test_the_contract_asks_for_close_for_pictures_and_for_the_frame_restored():
+    shut, flat, same = Grid(), Grid(), Reusing()
+    shut.close = None
+    flat.observation_space, flat.frame = spaces.Box(0, 255, (8,), np.uint8), lambda: np.zeros(8, np.uint8)
+    same.restore = lambda snapshot: Reusing.restore(same, bytes((3, 3)))
+    for env, said in ((shut, r"lacks close\(\)"), (flat, r"\(H, W\)"), (same, "same frame")):
+        with pytest.raises(InputError, match=said):
+            envs.check_contract(env)
 
 
 # ------------------------------------------- the emulators, on a stand-in cartridge whose program runs in the real emulator
@@ -2201,6 +2411,16 @@ def test_verify_and_workers_in_the_emulators(rom, tmp_path, capsys):
         assert tensors_as_bytes(one) == tensors_as_bytes(two) and len(one["clusters"]) > 1
 
 
+def test_the_cartridge_has_frames_of_the_size_asked_for(rom):
+    env = PrinceOfPersia(rom, frame_size=40)
+    assert env.reset()[0].shape == (40, 40)
+    env.close()
+
+
+def test_the_cartridge_boots_for_a_second(prince):
+    assert memory(prince)[0] >= 50  # it counts its frames
+
+
 # ------------------------------------------------------------------------------------------ the methods compared (6.2, 6.3)
 
 BRIEF = replace(MAZE, steps=700, pretrain_steps=200, M=3, trajectory_steps=60, L=3, additional_steps=30)
@@ -2499,10 +2719,94 @@ def test_experiment_runs_resumes_and_gathers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(rbexplore, "EXPERIMENTS", {"methods": {"random": ["--method", "random"]}})
     line = ["--experiment", "methods", "--seeds", "2", "--steps", "2000", "--out", str(tmp_path)]
     assert rbexplore.main(line) == 0 and "done" in capsys.readouterr().out
-    rows = (tmp_path / "curves.csv").read_text().split()
-    assert len(rows) == 1 + 2 * 201 and (tmp_path / "maps.png").exists() and (tmp_path / "curves.png").exists()
-    assert rbexplore.main(line) == 0 and capsys.readouterr().out.count("was finished") == 2
+    assert (tmp_path / "maps.png").exists() and (tmp_path / "curves.png").exists()
+    rows = list(csv.DictReader((tmp_path / "curves.csv").open()))
+    for seed in "01":
+        mine = [row for row in rows if row["variant"] == "random" and row["seed"] == seed]
+        assert [int(row["steps"]) for row in mine] == list(range(0, 2001, 10))
+        last = metrics(tmp_path / f"random-{seed}")[-1][rbexplore.METRICS.index("coverage")]
+        assert float(mine[-1]["coverage"]) == pytest.approx(100 * float(last), abs=1e-4)
+    assert rbexplore.main([*line, "--workers", "2"]) == 0 and capsys.readouterr().out.count("was finished") == 2
     assert rbexplore.main([*line, "--M", "7"]) == 2 and "another configuration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_method_iterates_on_a_spent_budget_or_has_a_metric_without_a_column(method):
+    a = make_method(method, MAZE_FN, BRIEF, ppo=TINY_PPO).run()
+    assert a.row.keys() <= set(rbexplore.METRICS)
+    with pytest.raises(InputError, match="spent"):
+        a.iterate()
+
+
+def test_baselines_record_first_visits_and_check_the_contract():
+    a = make_method("random", MAZE_FN, BRIEF)
+    step, first = a.env.step, {a.env.unit(): 0}
+
+    def noted(action):
+        result = step(action)
+        if a.env.unit():
+            first.setdefault(a.env.unit(), a.steps + 1)
+        return result
+    a.env.step = noted
+    assert a.run().discovered == first
+
+    def broken():
+        env = Grid()
+        env.snapshot = None
+        return env
+    for method in ("random", "rnd"):
+        with pytest.raises(InputError, match="lacks snapshot"):
+            make_method(method, broken, QUICK)
+
+
+def test_ppo_discounts_as_its_configuration_says(monkeypatch):
+    given, inner = [], rbexplore.gae
+    monkeypatch.setattr(rbexplore, "gae", lambda *arguments: given.append(arguments[5:]) or inner(*arguments))
+    PPO(Corridor, BRIEF, "cpu", replace(TINY_PPO, gamma=0.9, gae_lambda=0.8, episodic=True), Goal).iterate()
+    assert given == [(0.9, 0.8, True)]
+
+
+def test_icm_beta_weighs_the_forward_loss():
+    icm = ICM(BRIEF, replace(TINY_PPO, icm_beta=1.0), (32, 32), 7, "cpu")
+    icm.update(*transitions(20))
+    assert not any(p.grad.any() for p in icm.inverse_model.parameters())
+    assert all(p.grad.any() for p in icm.forward_model.parameters())
+
+
+def test_the_oracle_plays_the_level_asked_for():
+    env = make_method("oracle", functools.partial(make_env, "maze", level=2, frame_size=48), BRIEF).env
+    assert (env.level, env.frame_size) == (2, 48)
+
+
+def test_a_curve_counts_the_units_of_its_step():
+    assert rbexplore.coverage_curve({(0,): 5, (1,): 6}, np.array([4, 5, 6]), 4).tolist() == [0, 25, 50]
+
+
+def test_a_run_without_clusters_has_nothing_to_verify(tmp_path, capsys):
+    assert main(["--method", "random", "--steps", "600", "--no-figures", "--out", str(tmp_path)]) == 0
+    check_refused(capsys, tmp_path, ["--verify", str(tmp_path)], "no clusters to verify")
+
+
+def test_an_experiments_runs_have_its_seeds_options_and_environment():
+    def lines_of(*argv):
+        return rbexplore.runs_of(parser().parse_args(["--experiment", "methods", *argv]))
+    assert {seed for _, seed in lines_of("--seed", "5", "--seeds", "2")} == {5, 6}
+    for line in lines_of("--no-prefix", "--keep-buffer").values():
+        config = settings_of(parser().parse_args(line))["config"]
+        assert not config["prefix"] and config["keep_buffer"]
+    assert {variant for variant, _ in lines_of("--env", "montezuma")} == set(METHODS) - {"oracle"}
+
+
+def test_an_experiment_refuses_before_it_begins(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(rbexplore, "EXPERIMENTS", {"methods": {"random": ["--method", "random"]}})
+    (tmp_path / "file").write_text("no folder")
+    (tmp_path / "damaged" / "random-0").mkdir(parents=True)
+    (tmp_path / "damaged" / "random-0" / "config.json").write_text("{")
+    for folder, said in (("file/run", "cannot be written"), ("damaged", "cannot be read")):
+        line = ["--experiment", "methods", "--seeds", "1", "--no-figures", "--out", str(tmp_path / folder)]
+        check_refused(capsys, tmp_path, line, said)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    check_refused(capsys, tmp_path, ["--experiment", "methods", "--out", str(tmp_path / "run")], "figures need matplotlib")
 
 
 # ------------------------------------------------------------------------------------------------- the README tells the truth
@@ -3125,6 +3429,58 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      '        replayed = replayed and unit == a.env.unit()\n',
      '',
      'test_verify_tells'),
+    ('R17', 'the surplus of the larger class is never drawn',
+     '[rng.permutation(np.flatnonzero(self.y == y)) for y in (0, 1)]',
+     '[np.flatnonzero(self.y == y) for y in (0, 1)]',
+     'test_R17_'),
+    ('seeds', 'all purposes share one stream',
+     '[self.config.seed, self.iteration, PURPOSES.index(purpose), index + 1]',
+     '[self.config.seed, self.iteration, index + 1]',
+     'test_each_purpose'),
+    ('seeds', 'every seed has the same networks',
+     'generator = torch.Generator().manual_seed(seed)',
+     'generator = torch.Generator().manual_seed(0)',
+     'test_each_seed'),
+    ('seeds', 'the environment is not seeded',
+     'self.s_init = self.env.reset(seed=self.config.seed)[0].copy()\n        self.snap_init, self.unit_init',
+     'self.s_init = self.env.reset()[0].copy()\n        self.snap_init, self.unit_init',
+     'test_a_seeded'),
+    ('R18', 'the gradient is clipped after the step',
+     '        nn.utils.clip_grad_norm_(self.parameters(), clip)\n        self.optimiser.step()\n',
+     '        self.optimiser.step()\n        nn.utils.clip_grad_norm_(self.parameters(), clip)\n',
+     'test_R18_the_gradient'),
+    ('R18', "RND's size is fixed",
+     'if config.rnd_encoder == "small" else NATURE, config.rnd_features\n        with',
+     'if config.rnd_encoder == "small" else NATURE, 512\n        with',
+     'test_R18_R20'),
+    ('R19', 'rates of pairs that R knows',
+     'self.similarity.rates(pairs, self.rng("rates"))',
+     'self.similarity.rates(Pairs.joined([*self.replay, pairs]), self.rng("rates"))',
+     'test_R19_rates'),
+    ('S4.2-20', 'a prefix keeps its whole trajectory in memory',
+     'tau.frames[since].copy()',
+     'tau.frames[since]',
+     'test_a_prefix_does'),
+    ('S6.2-04', 'a spent budget is not noticed',
+     "paper's order. Returns its metrics.\"\"\"\n        self.check_budget()\n",
+     "paper's order. Returns its metrics.\"\"\"\n",
+     'test_no_method_iterates'),
+    ('S5-03', 'coverage keeps last visits',
+     '            self.discovered.setdefault(unit_key(unit), self.steps)\n        return frame',
+     '            self.discovered[unit_key(unit)] = self.steps\n        return frame',
+     'test_baselines_record'),
+    ('S6.2-03', "ICM's losses exchange their weights",
+     '((1 - self.beta) * inverse + self.beta * forward).backward()',
+     '(self.beta * inverse + (1 - self.beta) * forward).backward()',
+     'test_icm_beta'),
+    ('S6.2-03', 'the oracle always plays level 1',
+     'functools.partial(ExactMaze, maze.level, maze.frame_size)',
+     'functools.partial(ExactMaze, frame_size=maze.frame_size)',
+     'test_the_oracle'),
+    ('S6.2-03', 'discount and lambda exchanged',
+     'values, *ends, p.gamma, p.gae_lambda, p.episodic)',
+     'values, *ends, p.gae_lambda, p.gamma, p.episodic)',
+     'test_ppo_discounts'),
 ]
 
 warnings.filterwarnings("ignore", category=pytest.PytestUnknownMarkWarning)  # no configuration file registers the mark
