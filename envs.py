@@ -126,7 +126,7 @@ class Maze(PersistentEnv):
     unit_name = "tiles"
 
     def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
-        if level not in tuple(LEVELS):  # a tuple, since a list cannot be looked up in a dict
+        if not isinstance(level, int) or level not in LEVELS:
             raise InputError(f"unknown maze level {level!r}: there are {', '.join(map(str, sorted(LEVELS)))}")
         if not isinstance(frame_size, int) or frame_size < 32:
             raise InputError(f"frame_size must be a whole number of pixels, 32 or more, and not {frame_size!r}")
@@ -360,7 +360,7 @@ class EmulatorEnv(PersistentEnv):
         unpacker, pixels = zlib.decompressobj(zdict=self._dictionary), len(self._frame)
         try:
             content = unpacker.decompress(snapshot)  # zlib compares the checksums of dictionary and content
-            loaded = unpacker.eof and self._load(content[pixels:]) is not False
+            loaded = unpacker.eof and not unpacker.unused_data and self._load(content[pixels:]) is not False
         except (zlib.error, TypeError):
             loaded = False
         if not loaded:
@@ -388,7 +388,7 @@ class PrinceOfPersia(EmulatorEnv):
     unit_name = "units of 32 x 32 pixels"
 
     def __init__(self, rom: str | None = None, level: int = 1, state: str | None = None, frame_size: int = 96):
-        if level not in range(1, 15):
+        if not isinstance(level, int) or level not in range(1, 15):
             raise InputError(f"Prince of Persia has levels 1 to 14, not {level}")
         if not rom:
             raise InputError("Prince of Persia needs your own cartridge image: --rom FILE.nes")

@@ -861,6 +861,69 @@ def test_a_prefix_does_not_keep_its_whole_trajectory_in_memory():
     assert all(v.path.frames.base is None for v in list(graph.clusters.values())[1:])
 
 
+def test_networks_do_not_depend_on_torchs_generator():
+    made = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        made.append((weights(SimilarityModel(MAZE, (32, 32))), weights(RND(MAZE, (32, 32)).predictor)))
+    assert made[0] == made[1]
+
+
+def test_a_centre_does_not_keep_its_trajectory_in_memory():
+    t, (graph, stub) = tau(list(range(0, 400, 10))), grow([])
+    graph.add_trajectory(t, stub, 0.5)
+    assert all(np.shares_memory(v.frame, v.path.frames) for v in graph.clusters.values())
+
+
+def test_prefix_pairs_of_a_short_trajectory_too():
+    a = algorithm()
+    a.graph, _ = grow([(0, list(range(31)))], lambda first, second: 1.0 * (first // 30 == second // 30))
+    assert a.make_pairs([tau([*range(1000, 1010)], 1)]).counts["exploration prefix"] == 10
+
+
+def test_the_novel_share_is_of_this_iteration():
+    a, _ = with_rewards({0: 9.0, 1: 0.0}, beta=2.5, keep_buffer=True)
+    for _ in range(2):
+        a.additional_trajectories([tau([0, 1])])
+        assert a.row["novel_share"] == 0.5
+
+
+def test_R18_rnds_error_is_a_mean_over_features_and_that_before_the_step():
+    rnd, x = RND(MAZE, (32, 32)), pictures(8)
+    rnd.pixels.join(Moments(x))
+    z = torch.from_numpy(rnd.pixels.standardise(x).clip(-5, 5).astype(np.float32))[:, None]
+    before = rnd.distance(x).detach()
+    assert torch.allclose(before, ((rnd.predictor(z) - rnd.target(z)) ** 2).sum(1) / MAZE.rnd_features, rtol=1e-4)
+    assert np.allclose(rnd.update(x), before.numpy(), rtol=1e-6)
+
+
+def test_R18_rnds_batches_mix_the_states_of_trajectories(monkeypatch):
+    rnd, x, seen = RND(replace(MAZE, rnd_batch=8), (32, 32)), pictures(32), []
+    monkeypatch.setattr(rnd, "update", lambda frames: seen.extend(f.tobytes() for f in frames) or np.zeros(len(frames)))
+    rnd.fit([x], np.random.default_rng(0), lambda *_, **__: None)
+    ordered = [f.tobytes() for f in x]
+    assert seen != ordered and sorted(seen) == sorted(ordered)
+
+
+@pytest.mark.parametrize("bad", [float("inf"), float("nan")])
+def test_a_loss_that_is_not_finite_stops(bad):
+    with pytest.raises(FloatingPointError):
+        rbexplore.finite(torch.tensor(bad), "R")
+
+
+def test_the_R_of_a_new_cluster_is_the_best_there_was():
+    graph, stub = Graph(frame(0), b"0", MAZE), Stub(table({(0, 20): 0.1, (10, 20): 0.4}))
+    graph.embed_centres(stub)
+    assert graph.add_trajectory(tau([0, 10, 20]), stub, 0.5)["R"] == [None, 0.0, 0.4]
+
+
+def test_check_finds_a_loop():
+    graph, _ = grow([(0, [0, 10])])
+    graph.add_arc(1, 1, 1)
+    with pytest.raises(AssertionError, match="two clusters"):
+        graph.check()
+
+
 # ------------------------------------------------------------ the loop, the run folder, the environments
 
 TINY = replace(MAZE, steps=4000, pretrain_steps=600, M=4, L=3, trajectory_steps=60, additional_steps=40, merge_every=3)
@@ -1192,6 +1255,28 @@ def test_a_worker_resets_its_environment_before_the_first_job():
             return super().restore(snapshot)
     with ThreadPoolExecutor(1) as pool:
         explorer(env_fn=Fresh, executor=pool)[0].iterate()
+
+
+def test_each_trajectory_has_a_seed_of_its_own_also_near_the_end_of_the_budget(monkeypatch):
+    (a, _), seeds, inner = explorer(replace(QUICK, pretrain_steps=0, steps=100)), [], rbexplore.walk
+    a.restart()
+    monkeypatch.setattr(rbexplore, "walk", lambda env, at, seed, *rest: seeds.append(tuple(seed)) or inner(env, at, seed, *rest))
+    a.collect("explore", [a.snap_init] * 4, 30)  # 120 steps do not fit
+    assert len(seeds) == len(set(seeds)) > 2
+
+
+def test_a_death_on_a_blank_frame_ends_the_trajectory():
+    class Dark(Grid):
+        def step(self, action):
+            frame, reward, _, truncated, info = super().step(action)
+            return frame, reward, info["blank"], truncated, info
+    t = walk(Dark(), bytes((4, 3)), [0], 200, True)
+    assert t.units[-1][0] == 5 and all(u[0] != 5 for u in t.units[:-1])
+
+
+def test_additional_trajectories_keep_no_snapshots():
+    a = explorer()[0]
+    assert all(not t.snapshots for t in a.collect("additional", [a.snap_init] * 2, 30))
 
 
 # ------------------------------------------------------------------------------ the domain and the experiments (5, 6)
@@ -1862,6 +1947,50 @@ def test_a_warning_names_its_cause(tmp_path, capsys):
         assert out.count("warning") == 1 and f"every state {what}" in out
 
 
+def test_ranges_of_the_configuration():
+    assert replace(MAZE, beta=2).beta == 2
+    for wrong in ({"seed": -1}, {"n": 0}, {"novelty_window": 0}, {"seed": 2**63 + 1}, {"replay_iterations": -1}):
+        with pytest.raises(InputError):
+            replace(MAZE, **wrong)
+
+
+def test_what_serves_a_learned_R_alone_is_not_asked_of_cells():
+    assert settings("--method", "cells", "--pretrain-steps", "500", "--L", "3")["config"]["pretrain_steps"] == 0
+
+
+def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, capsys):
+    def die(self):
+        raise rbexplore.BrokenProcessPool
+    monkeypatch.setattr(RbExplore, "run", die)
+    assert main(["--no-figures", "--out", str(tmp_path / "run")]) == 2
+    assert "a worker process died" in capsys.readouterr().err
+
+
+def test_a_resumed_run_keeps_its_method_and_threads(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    check_refused(capsys, tmp_path, ["--resume", str(folder), "--no-figures", "--method", "rnd"], "keeps its options")
+    text = (folder / "config.json").read_text()
+    assert '"threads": 1' in text
+    (folder / "config.json").write_text(text.replace('"threads": 1', '"threads": 2'))
+    check_refused(capsys, tmp_path, ["--resume", str(folder), "--no-figures"], "another configuration")
+
+
+def test_the_time_left_is_that_of_the_last_five_iterations(tmp_path, capsys):
+    run = rbexplore.Run(tmp_path, {"config": {"steps": 2000}}, explorer()[0])
+    row = {"phase": "explore", "coverage": None, "units": 1}
+    run.rows = [row | {"iteration": k, "steps": 100 * k, "seconds": 10.0} for k in range(1, 11)]
+    run.show(run.rows[-1])
+    assert capsys.readouterr().out.split()[-1] == "1:40"  # 1,000 steps at 10 a second
+
+
+def test_no_warning_in_pretraining(tmp_path, capsys):
+    run = rbexplore.Run(tmp_path, {"config": {"steps": 2000}}, explorer()[0])
+    for phase in ("pretrain", "explore"):
+        run.rows = [{"iteration": 1, "steps": 9, "seconds": 1.0, "phase": phase, "coverage": 0.1, "r_true_positive": 0.1}]
+        run.show(run.rows[0])
+        assert ("warning" in capsys.readouterr().out) == (phase == "explore")
+
+
 # ----------------------------------------------------------------------------------------------------------- the maze
 
 
@@ -2010,6 +2139,31 @@ def test_the_contract_asks_for_close_for_pictures_and_for_the_frame_restored():
     for env, said in ((shut, r"lacks close\(\)"), (flat, r"\(H, W\)"), (same, "same frame")):
         with pytest.raises(InputError, match=said):
             envs.check_contract(env)
+
+
+def test_distances_begin_at_the_snapshot():
+    env = Maze()
+    env.step(2), env.step(2)
+    snapshot = env.snapshot()
+    assert snapshot != bytes((env.level, *env.start)) and env.distances(snapshot)[snapshot] == 0
+
+
+def test_a_maze_takes_whole_levels_and_whole_snapshots_and_renders_where_asked():
+    for level in (1.0, [1]):
+        with pytest.raises(InputError, match="unknown maze level"):
+            Maze(level)
+    env = Maze()
+    with pytest.raises(InputError, match="no snapshot"):
+        env.restore(env.snapshot() + b"\0")
+    assert env.render() is None and Maze(render_mode="rgb_array").render().shape == (360, 360, 3)
+
+
+def test_a_maze_keeps_few_frames():
+    env = Maze()
+    env._seen |= dict.fromkeys(range(4095))
+    for snapshot in env.distances(env.snapshot()):
+        env.restore(snapshot)
+    assert len(env._seen) <= 4096
 
 
 # ------------------------------------------- the emulators, on a stand-in cartridge whose program runs in the real emulator
@@ -2421,6 +2575,22 @@ def test_the_cartridge_boots_for_a_second(prince):
     assert memory(prince)[0] >= 50  # it counts its frames
 
 
+def test_the_cartridge_refuses_what_it_cannot_use(rom, prince, tmp_path):
+    packed = bytearray(gzip.compress(bytes(range(256)) * 9))
+    packed[10:14] = b"\xff" * 4
+    (tmp_path / "bad").write_bytes(bytes(packed))
+    with pytest.raises(InputError, match="cannot read"):
+        PrinceOfPersia(rom, state=str(tmp_path / "bad"))
+    with pytest.raises(InputError, match="levels 1 to 14"):
+        PrinceOfPersia(rom, level=1.0)
+    with pytest.raises(InputError, match="damaged"):
+        prince.restore(prince.snapshot() + b"x")
+
+
+def test_full_coverage_of_every_level_of_the_cartridge():
+    assert PrinceOfPersia.FULL_COVERAGE == (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
+
+
 # ------------------------------------------------------------------------------------------ the methods compared (6.2, 6.3)
 
 BRIEF = replace(MAZE, steps=700, pretrain_steps=200, M=3, trajectory_steps=60, L=3, additional_steps=30)
@@ -2807,6 +2977,52 @@ def test_an_experiment_refuses_before_it_begins(tmp_path, monkeypatch, capsys):
         check_refused(capsys, tmp_path, line, said)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     check_refused(capsys, tmp_path, ["--experiment", "methods", "--out", str(tmp_path / "run")], "figures need matplotlib")
+
+
+def test_the_bonus_is_scaled_by_all_sums_so_far():
+    r = np.array([[1.0, 10], [2, 20], [3, 30]])
+    a = PPO(Corridor, BRIEF, "cpu", replace(TINY_PPO, actors=2, gamma=0.0), Goal)
+    a.scaled(r)
+    assert np.allclose(a.scaled(0 * r), 0) and np.allclose(a.scaled(r), r / np.std([*r.ravel(), *(0 * r).ravel(), *r.ravel()]))
+
+
+def test_losses_of_ppo_and_of_icm_must_be_finite():
+    nan, a = np.full(3, np.nan), PPO(Corridor, BRIEF, "cpu", TINY_PPO, Goal)
+    with pytest.raises(FloatingPointError, match="PPO"):
+        a.update(a.seen, np.zeros(3, int), nan, nan, nan)
+    icm = ICM(BRIEF, TINY_PPO, (32, 32), 7, "cpu")
+    icm.encoder[0].weight.data[:] = float("nan")
+    with pytest.raises(FloatingPointError, match="ICM"):
+        icm.update(*transitions(9))
+
+
+def test_an_interrupted_experiment_goes_on_also_with_other_versions(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(rbexplore, "EXPERIMENTS", {"methods": {"random": ["--method", "random"]}})
+    line = ["--experiment", "methods", "--seeds", "1", "--steps", "9000", "--no-figures", "--out", str(tmp_path)]
+    (command,) = rbexplore.runs_of(parser().parse_args(line)).values()
+    tell = rbexplore.Run.tell
+
+    def stop(self, event, **data):
+        tell(self, event, **data)
+        if event == "row":
+            raise KeyboardInterrupt
+    with monkeypatch.context() as patch:
+        patch.setattr(rbexplore.Run, "tell", stop)
+        assert main(command) == 130
+    assert main(line) == 0 and "random-0 done" in capsys.readouterr().out
+    assert int(metrics(tmp_path / "random-0")[-1][rbexplore.METRICS.index("steps")]) == 9000
+    monkeypatch.setattr(rbexplore, "versions", lambda: {"python": "9"})
+    assert main(line) == 0 and "was finished" in capsys.readouterr().out
+
+
+def test_an_experiments_map_is_that_of_the_best_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(rbexplore, "EXPERIMENTS", {"methods": {"random": ["--method", "random"]}})
+    given, inner = [], rbexplore.maps_figure
+    monkeypatch.setattr(rbexplore, "maps_figure", lambda *of: given.append(of[1]) or inner(*of))
+    monkeypatch.setattr(rbexplore, "best", lambda of: 1)
+    assert main(["--experiment", "methods", "--seeds", "2", "--steps", "600", "--out", str(tmp_path)]) == 0
+    state = torch.load(tmp_path / "random-1" / "checkpoint.pt", weights_only=True)["algorithm"]
+    assert list(given[0].values()) == [{tuple(unit): step for unit, step in state["discovered"]}]
 
 
 # ------------------------------------------------------------------------------------------------- the README tells the truth
