@@ -1229,23 +1229,13 @@ def memory(a: RbExplore) -> float:
 
 
 def write_atomically(path: pathlib.Path, write: Callable) -> None:
-    """A reader finds the old file or the new one and never half of one, also after a kill. InputError where that fails."""
+    """A reader finds the old file or the new one and never half of one, also after a kill."""
     temporary = path.with_name(path.name + ".new")
-    try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}; make room, or choose another place") from None
-
-
-def make_folder(folder: pathlib.Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written: {error.strerror}; choose another folder with --out") from None
+    with open(temporary, "wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
 
 
 class Run:
@@ -1261,7 +1251,7 @@ class Run:
         """Begin in a folder that holds no run yet."""
         if (self.folder / "config.json").exists():
             raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
-        make_folder(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
         self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
         write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
 
@@ -1626,7 +1616,7 @@ def execute(command: list[str]) -> str:
             if max((int(row["steps"]) for row in csv.DictReader(file)), default=0) >= settings["config"]["steps"]:
                 return f"{folder} was finished"
         command = ["--resume", str(folder), "--no-figures", "--workers", str(settings["workers"])]
-    make_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "log.txt", "a") as log:
         code = subprocess.run([sys.executable, __file__, *command], stdout=log, stderr=log).returncode
     if code:
@@ -1793,6 +1783,10 @@ def main(argv: list[str] | None = None) -> int:
         return command(parser().parse_args(argv))
     except (InputError, FloatingPointError) as error:
         print(f"rbexplore: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        place = error.filename or "a file"  # a full disk names none
+        print(f"rbexplore: {place} cannot be written: {error.strerror}; make room, or choose another place", file=sys.stderr)
         return 2
     except BrokenProcessPool:
         print("rbexplore: a worker process died, of memory perhaps: go on with --resume and fewer --workers", file=sys.stderr)

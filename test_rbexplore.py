@@ -859,6 +859,7 @@ def test_a_prefix_does_not_keep_its_whole_trajectory_in_memory():
     t, (graph, stub) = tau(list(range(0, 400, 10))), grow([])
     graph.add_trajectory(t, stub, 0.5)
     assert all(v.path.frames.base is None for v in list(graph.clusters.values())[1:])
+    assert all(np.shares_memory(v.frame, v.path.frames) for v in graph.clusters.values())
 
 
 def test_networks_do_not_depend_on_torchs_generator():
@@ -867,12 +868,6 @@ def test_networks_do_not_depend_on_torchs_generator():
         torch.manual_seed(seed)
         made.append((weights(SimilarityModel(MAZE, (32, 32))), weights(RND(MAZE, (32, 32)).predictor)))
     assert made[0] == made[1]
-
-
-def test_a_centre_does_not_keep_its_trajectory_in_memory():
-    t, (graph, stub) = tau(list(range(0, 400, 10))), grow([])
-    graph.add_trajectory(t, stub, 0.5)
-    assert all(np.shares_memory(v.frame, v.path.frames) for v in graph.clusters.values())
 
 
 def test_prefix_pairs_of_a_short_trajectory_too():
@@ -1242,19 +1237,18 @@ def test_units_become_plain_keys():
     assert {type(x) for x in rbexplore.unit_key(np.array([1, 2]))} == {int}
 
 
-def test_a_worker_resets_its_environment_before_the_first_job():
-    class Fresh(Grid):
-        ready = False
+def test_a_worker_resets_its_environment_before_the_first_job(monkeypatch):
+    tapes = []
 
-        def reset(self, **named):
-            self.ready = True
-            return super().reset(**named)
-
-        def restore(self, snapshot):
-            assert self.ready
-            return super().restore(snapshot)
+    def recorded():
+        env, tape = Grid(), Recorder()
+        tapes.append(tape)
+        for name in ("reset", "restore"):
+            tape.wrap(monkeypatch, env, name)
+        return env
     with ThreadPoolExecutor(1) as pool:
-        explorer(env_fn=Fresh, executor=pool)[0].iterate()
+        explorer(env_fn=recorded, executor=pool)[0].iterate()
+    assert [tape.calls[0][0] for tape in tapes] == ["reset", "reset"]
 
 
 def test_each_trajectory_has_a_seed_of_its_own_also_near_the_end_of_the_budget(monkeypatch):
@@ -1958,12 +1952,16 @@ def test_what_serves_a_learned_R_alone_is_not_asked_of_cells():
     assert settings("--method", "cells", "--pretrain-steps", "500", "--L", "3")["config"]["pretrain_steps"] == 0
 
 
-def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, capsys):
-    def die(self):
-        raise rbexplore.BrokenProcessPool
-    monkeypatch.setattr(RbExplore, "run", die)
+@pytest.mark.parametrize("error, said", [
+    (rbexplore.BrokenProcessPool(), "a worker process died"),
+    (OSError(28, "No space left on device"), "a file cannot be written: No space")])
+def test_a_dead_worker_and_a_full_disk_are_one_line(tmp_path, monkeypatch, capsys, error, said):
+    def fail(self):
+        raise error
+    monkeypatch.setattr(RbExplore, "run", fail)
     assert main(["--no-figures", "--out", str(tmp_path / "run")]) == 2
-    assert "a worker process died" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
 
 
 def test_a_resumed_run_keeps_its_method_and_threads(finished, tmp_path, capsys):
