@@ -3007,7 +3007,8 @@ def test_an_interrupted_experiment_goes_on_also_with_other_versions(tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(rbexplore.Run, "tell", stop)
         assert main(command) == 130
-    assert main(line) == 0 and "random-0 done" in capsys.readouterr().out
+    assert main([*line, "--workers", "2"]) == 0 and "random-0 done" in capsys.readouterr().out
+    assert "2 worker(s)" in (tmp_path / "random-0" / "log.txt").read_text()
     assert int(metrics(tmp_path / "random-0")[-1][rbexplore.METRICS.index("steps")]) == 9000
     monkeypatch.setattr(rbexplore, "versions", lambda: {"python": "9"})
     assert main(line) == 0 and "was finished" in capsys.readouterr().out
