@@ -1715,19 +1715,32 @@ def test_killed_twice_and_resumed_equals_uninterrupted(finished, tmp_path):
     assert outcome(folder) == outcome(finished) and not FIGURES & {p.name for p in folder.iterdir()}
 
 
-@pytest.mark.parametrize("write", range(9, 11))
-def test_killed_between_two_writes_and_resumed_equals_uninterrupted(finished, tmp_path, monkeypatch, write):
-    replaced, folder = itertools.count(1), str(tmp_path / "run")
+def killed_at(write: int, argv: list[str]) -> None:
+    """Run until this file is to be replaced by its new version, and no further."""
+    replaced = itertools.count(1)
 
     def crash(old, new, inner=os.replace):
         if next(replaced) == write:
             raise SystemExit("killed")
         inner(old, new)
-    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
         patch.setattr(rbexplore.os, "replace", crash)
-        main([*TINY_RUN, "--no-figures", "--out", folder])
+        main(argv)
+
+
+@pytest.mark.parametrize("write", range(9, 11))
+def test_killed_between_two_writes_and_resumed_equals_uninterrupted(finished, tmp_path, write):
+    folder = str(tmp_path / "run")
+    killed_at(write, [*TINY_RUN, "--no-figures", "--out", folder])
     assert main(["--resume", folder, "--trace", "--no-figures"]) == 0
     assert outcome(tmp_path / "run") == outcome(finished)
+
+
+@pytest.mark.parametrize("write", [1, 2, 3])
+def test_a_run_killed_while_it_is_made_leaves_a_folder_that_can_be_used(tmp_path, write):
+    line = ["--method", "random", "--steps", "2000", "--no-figures", "--out", str(tmp_path / "run")]
+    killed_at(write, line)
+    assert main(line) == 0
 
 
 def test_ctrl_c_exits_with_130_leaves_figures_and_can_be_resumed(finished, tmp_path):
@@ -1907,20 +1920,6 @@ def test_a_trace_goes_on_at_a_resume_that_does_not_ask_for_it(tmp_path):
     assert main(["--resume", str(tmp_path / "c"), "--no-figures"]) == 0
     events = [json.loads(line) for line in (tmp_path / "c" / "trace.jsonl").read_text().splitlines()]
     assert [e["iteration"] for e in events if e["event"] == "iteration"] == list(range(1, len(metrics(tmp_path / "c")) + 1))
-
-
-@pytest.mark.parametrize("write", [1, 2, 3])
-def test_a_run_killed_while_it_is_made_leaves_a_folder_that_can_be_used(tmp_path, monkeypatch, write):
-    replaced, line = itertools.count(1), ["--method", "random", "--steps", "2000", "--no-figures", "--out", str(tmp_path / "run")]
-
-    def crash(old, new, inner=os.replace):
-        if next(replaced) == write:
-            raise SystemExit("killed")
-        inner(old, new)
-    with monkeypatch.context() as patch, pytest.raises(SystemExit):
-        patch.setattr(rbexplore.os, "replace", crash)
-        main(line)
-    assert main(line) == 0
 
 
 def test_seconds_are_those_of_an_iteration(tmp_path):
