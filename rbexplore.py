@@ -138,9 +138,9 @@ class Config:
 
 
 # The maze's: what a small image, a small budget and a CPU need; the rest is the paper's.
-MAZE = Config(steps=100_000, pretrain_steps=8_000, trajectory_steps=150, L=30, frame_size=32,
+MAZE = Config(steps=100_000, pretrain_steps=8_000, M=20, trajectory_steps=150, L=20, frame_size=32,
               encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_batch=128,
-              rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3)
+              rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3, rnd_batch=64)
 CONFIGS = {"paper": Config(), "maze": MAZE}
 
 # ------------------------------------------------------------------------------------ the algorithm (4; S4-01 ... S4-07)
@@ -262,14 +262,15 @@ class RbExplore:
         return trajectories
 
     def make_pairs(self, trajectories: list["Trajectory"]) -> "Pairs":
-        """Step 2: label pairs of exploration and of additional trajectories, and prefixes for the former (S4-02, S4.1-09)."""
+        """Step 2: label pairs of exploration and of additional trajectories, and pairs with their prefixes (S4-02, S4.1-09)."""
         additional = self.additional_trajectories(trajectories)
         pairs, rng, prefix_rng = Pairs(), self.rng("pairs"), self.rng("prefix")  # so --no-prefix leaves the rest alone
         for source, taus in (("exploration", trajectories), ("additional", additional)):
             for tau in taus:
                 pairs.add_trajectory(source, tau.frames, self.config, rng)
-                if self.config.prefix and tau.start:  # cluster 0 is the initial one: its prefix is empty (S4.2-21)
-                    pairs.add_prefix(tau.frames, self.graph.clusters[tau.start].path.states(), self.config, prefix_rng)
+                if self.config.prefix and tau.start:  # from cluster 0, the initial one, there is none (S4.1-09, S4.2-21; R30)
+                    prefix = self.graph.clusters[tau.start].path.states() + list(tau.since)
+                    pairs.add_prefix(source, tau.frames, prefix, self.config, prefix_rng)
         self.tell("pairs", **pairs.counts)
         return pairs
 
@@ -278,15 +279,21 @@ class RbExplore:
         if not self.config.keep_buffer:
             self.novel = []
         states = novel = 0
+        origin: dict[bytes, tuple[Trajectory, int]] = {}  # a novel state: the (latest) trajectory that met it, and where
         for k, tau in enumerate(trajectories):
             reward = self.novelty.reward(tau.frames)  # (T,)
             found = np.flatnonzero(reward > self.config.beta)
             self.novel += [tau.snapshots[i] for i in found]
+            origin |= {tau.snapshots[i]: (tau, i) for i in found}
             if len(found):
                 self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
             states, novel = states + len(reward), novel + len(found)
-        sample = self.rng("buffer").permutation(len(self.novel))[: self.config.L]
-        additional = self.collect("additional", [self.novel[i] for i in sample], self.config.additional_steps)
+        sample = [self.novel[i] for i in self.rng("buffer").permutation(len(self.novel))[: self.config.L]]
+        additional = self.collect("additional", sample, self.config.additional_steps)
+        for tau, snapshot in zip(additional, sample, strict=False):  # fewer, where the budget of steps ended
+            if snapshot in origin:  # else it is of an earlier iteration (keep_buffer), whose trajectories are gone
+                met, i = origin[snapshot]
+                tau.start, tau.since = met.start, met.frames[1 : i + 1]
         self.row |= {"novel_share": novel / states, "additional": len(additional)}
         return additional
 
@@ -327,7 +334,8 @@ class Trajectory:
     snapshots: list[bytes]  # T; none for an additional trajectory
     actions: list[bytes]  # T; actions[t] lead from state t-1 to state t: one, or more across blank frames (R24)
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
-    start: int | None = None  # the cluster it started from; none for an additional trajectory
+    start: int | None = None  # the cluster it started from; for an additional one, that of the trajectory that met its s_1
+    since: np.ndarray | tuple = ()  # (k, H, W) the states from that cluster's centre (exclusive) to s_1: additional ones only
 
 
 def walk(env, snapshot: bytes, seed: list[int], steps: int, keep_snapshots: bool) -> Trajectory:
@@ -395,15 +403,16 @@ class Pairs:
         self._add(f"{source} positive", base + i, base + near, 1, rng)
         self._add(f"{source} negative", base + i_far, base + far, 0, rng)
 
-    def add_prefix(self, frames: np.ndarray, prefix: list[np.ndarray], config: Config, rng: np.random.Generator) -> None:
+    def add_prefix(self, source: str, frames: np.ndarray, prefix: list[np.ndarray], config: Config,
+                   rng: np.random.Generator) -> None:
         """(c) of figure 2: each state i of the trajectory added last with a state j of its full prefix, drawn from all that
         are more than N away along the joined path (S4.2-22, S4.2-23, R16)."""
         i, base = np.arange(len(frames)), len(self.states)
         # The prefix ends with the state that the trajectory begins with, so (P - 1 - j) + i steps lie in between.
         eligible = np.clip(len(prefix) - 1 - config.N + i, 0, len(prefix))
         i = np.flatnonzero(eligible)
-        self.states += prefix
-        self._add("exploration prefix", base - len(frames) + i, base + rng.integers(eligible[i]), 0, rng)
+        self.states += [prefix[j] for j in rng.integers(eligible[i])]
+        self._add(f"{source} prefix", base - len(frames) + i, base + np.arange(len(i)), 0, rng)
 
     def _add(self, kind: str, s_1: np.ndarray, s_2: np.ndarray, y: int, rng: np.random.Generator) -> None:
         index = np.stack([s_1, s_2], axis=1)  # (k, 2)
@@ -543,10 +552,17 @@ class SimilarityModel(nn.Module):
         return torch.cat([self.encoder(to_input(part, self.device)) for part in chunks(frames)])
 
     @torch.no_grad()
+    def probability(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        """What the network says of embeddings (K, d) and (K, d) or (d,): (K,) in [0, 1]."""
+        return torch.sigmoid(self.head(torch.cat([first, second.expand_as(first)], dim=1))).squeeze(1)
+
+    @torch.no_grad()
     def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-        """R of embeddings (K, d) and (K, d) or (d,) -> (K,) in [0, 1]."""
-        logits = self.head(torch.cat([first, second.expand_as(first)], dim=1))
-        return torch.sigmoid(logits).squeeze(1).cpu().numpy()
+        """R of embeddings (K, d) and (K, d) or (d,) -> (K,). R(s, s) is 1, as s is no step away from itself: else a state that
+        the network finds unlike itself would make one more cluster at each visit (R29)."""
+        rounding = 1e-5 * first.abs().amax(1)  # of embeddings of equal frames, which may come from batches of different sizes
+        same = (first - second).abs().amax(1) <= rounding
+        return torch.where(same, 1.0, self.probability(first, second)).cpu().numpy()
 
     def fit(self, pairs: Pairs, config: Config, rng: np.random.Generator, tell: Callable) -> float | None:
         """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs."""
@@ -572,12 +588,13 @@ class SimilarityModel(nn.Module):
         return finite(loss, "R")
 
     def rates(self, pairs: Pairs, rng: np.random.Generator, most: int = 500) -> dict[str, float]:
-        """How often R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
+        """How often the network's R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
         chosen = pairs.balanced(rng, most)
         if not len(chosen):
             return {}
         first, second = map(self.embed, pairs.frames(chosen))
-        right, similar = (self.score(first, second) > 0.5) == pairs.y[chosen], pairs.y[chosen] == 1
+        said, similar = self.probability(first, second).cpu().numpy() > 0.5, pairs.y[chosen] == 1
+        right = said == similar
         return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
                 "r_true_negative": float(right[~similar].mean())}
 
@@ -783,7 +800,7 @@ class RND:
         self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.rnd_learning_rate)
         self.device, self.batch = device, config.rnd_batch
         self.pixels = Moments()  # of each pixel, over all states trained on
-        self.errors: deque[Moments] = deque(maxlen=config.novelty_window)  # of the error, one an iteration
+        self.errors: deque[Moments] = deque(maxlen=config.novelty_window)  # of the error on the states just learned
 
     def distance(self, frames: np.ndarray) -> torch.Tensor:
         """Frames (B, H, W) -> the predictor's mean squared error (B,), on pixels standardised and clipped to +-5 (R4)."""
@@ -805,16 +822,21 @@ class RND:
         return recent.standardise(np.concatenate([self.distance(part).cpu().numpy() for part in chunks(frames)]))
 
     def fit(self, trajectories: list[np.ndarray], rng: np.random.Generator, tell: Callable) -> float:
-        """Update the normalisers and train the predictor, one pass; (T, H, W) each. Returns the mean loss."""
-        for part in (part for frames in trajectories for part in chunks(frames)):
+        """Update the normalisers and train the predictor, one pass; (T, H, W) each. Returns the mean loss.
+
+        The errors that make a reward comparable are those of the states just learned, after learning (R4): measured before,
+        the large errors of one new room would hide the next for as long as the window remembers them."""
+        parts = [part for frames in trajectories for part in chunks(frames)]
+        for part in parts:
             self.pixels.join(Moments(part))
         states, errors = [frame for frames in trajectories for frame in frames], []
         batches = np.array_split(rng.permutation(len(states)), math.ceil(len(states) / self.batch))
         for k, batch in enumerate(batches):
             errors.append(self.update(np.stack([states[s] for s in batch])))
             tell("progress", step="train RND", done=k + 1, total=len(batches))
-        self.errors.append(Moments(np.concatenate(errors)))
-        return float(self.errors[-1].mean)
+        with torch.no_grad():
+            self.errors.append(Moments(np.concatenate([self.distance(part).cpu().numpy() for part in parts])))
+        return float(np.mean(np.concatenate(errors)))
 
     def update(self, frames: np.ndarray) -> np.ndarray:
         """One step of the predictor on a batch (B, H, W). Returns the errors before it (B,)."""
@@ -1549,7 +1571,7 @@ class Profile:
             self.wrap(a, name, None)
         for name in ("step", "snapshot", "restore", "unit"):
             self.wrap(a.env, name, "environment")
-        for owner, names in ((a.similarity, ("embed", "score", "update")), (a.novelty, ("distance", "update"))):
+        for owner, names in ((a.similarity, ("embed", "probability", "score", "update")), (a.novelty, ("distance", "update"))):
             for name in names:
                 self.wrap(owner, name, "network")
 
@@ -1760,6 +1782,7 @@ def prepare(settings: dict):
     torch.set_num_threads(settings["threads"])
     torch.use_deterministic_algorithms(True)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS wants for that
+    torch.backends.cudnn.allow_tf32 = False  # whose rounding would hide that two embeddings are of equal frames (R29)
     try:
         torch.zeros(1, device=settings["device"]).cpu()
     except (RuntimeError, AssertionError) as error:

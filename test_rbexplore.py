@@ -319,7 +319,7 @@ def test_S4_1_07_classes_are_balanced():
 def test_rates_are_of_balanced_classes_and_each_of_its_own(monkeypatch):
     model, y = SimilarityModel(MAZE, (32, 32)), np.array([1] * 30 + [0] * 12)
     pairs = Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y)
-    monkeypatch.setattr(model, "score", lambda first, second: np.ones(len(first)))
+    monkeypatch.setattr(model, "probability", lambda first, second: torch.ones(len(first)))
     assert model.rates(pairs, np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 1, "r_true_negative": 0}
 
 
@@ -353,7 +353,7 @@ def test_a_residual_block_and_the_sizes_within_resnet18():
     assert features.shape == (1, 512, 3, 3)
 
 
-def test_R4_pixels_are_clipped_and_the_errors_of_all_states_counted(monkeypatch):
+def test_R4_pixels_are_clipped_and_the_errors_of_all_states_counted_as_they_are_after_training(monkeypatch):
     rnd, sizes = RND(replace(MAZE, rnd_batch=4), (32, 32)), []
     rnd.pixels.join(Moments(100 + pictures(50) % 10))
     far = np.stack([np.full((32, 32), shade, np.uint8) for shade in (200, 255)])
@@ -361,8 +361,29 @@ def test_R4_pixels_are_clipped_and_the_errors_of_all_states_counted(monkeypatch)
     assert one == other  # both are more than five standard deviations away
     update = rnd.update
     monkeypatch.setattr(rnd, "update", lambda frames: sizes.append(len(frames)) or update(frames))
-    rnd.fit([pictures(7), pictures(3, 1)], np.random.default_rng(0), lambda *_, **__: None)
+    states = pictures(7), pictures(3, 1)
+    loss = rnd.fit(list(states), np.random.default_rng(0), lambda *_, **__: None)
     assert rnd.errors[-1].count == sum(sizes) == 10 and max(sizes) <= 4
+    after = Moments(rnd.distance(np.concatenate(states)).detach().numpy())
+    assert np.allclose([rnd.errors[-1].mean, rnd.errors[-1].m2], [after.mean, after.m2], rtol=1e-4)
+    assert loss != pytest.approx(after.mean), "the loss is that of training"
+
+
+@pytest.mark.parametrize("scale", [0.01, 1, 100])
+def test_R29_a_state_is_similar_to_itself_whatever_the_network_says(scale):
+    model, frames = SimilarityModel(MAZE, (32, 32)), pictures(40)
+    model.encoder[-1].weight.data *= scale
+    model.head[-1].weight.data /= scale
+    nn_says = torch.sigmoid(model(frames, frames)).detach().numpy()
+    assert (nn_says < 0.99).all()
+    for size in (1, 3, 40):  # the rounding of an embedding depends on the batch that it is in
+        e = torch.cat([model.embed(frames[k : k + size]) for k in range(0, 40, size)])
+        assert (model.score(e, model.embed(frames)) == 1).all()
+        assert (model.score(e, model.embed(frames[7:8])[0]) == 1).tolist() == [k == 7 for k in range(40)]
+    close = e[:2].clone()
+    close[0, 3] += 1e-3 * scale
+    close[1, :3] += 1e-3 * scale
+    assert (model.score(close, e[:2]) < 1).all(), "one number that differs is enough"
 
 
 def test_S4_1_07_R_learns_that_1_means_close():
@@ -400,6 +421,20 @@ def prefix_pairs(start: int, **changes) -> tuple[Pairs, Counter]:
     assert centres(a.graph) == {0: 0, 1: 30}
     pairs = a.make_pairs([tau([*range(1000, 1040)], start)])
     return pairs, Counter((min(a, b) < 1000, y) for a, b, y in labelled(pairs))
+
+
+def test_S4_1_09_the_prefix_of_an_additional_trajectory_ends_with_the_novel_state_it_starts_from(monkeypatch):
+    """0 ... 30 lead to cluster 1. From it one trajectory meets the novel state 1003, another 1502; one from cluster 0, 1701."""
+    a, given = algorithm(), []
+    a.graph, _ = grow([(0, list(range(31)))], lambda first, second: 1.0 * (first // 30 == second // 30))
+    a.novelty.reward = lambda frames: np.array([9.0 * (n in (1003, 1502, 1701)) for n in numbers(frames)])
+    a.collect = lambda purpose, snapshots, steps: [tau([int(s), *range(2000, 2040)], None) for s in snapshots]
+    monkeypatch.setattr(Pairs, "add_prefix", lambda self, source, frames, prefix, *_:
+                        given.append((source, numbers(frames)[0], numbers(prefix))))
+    a.make_pairs([tau([30, *range(1001, 1011)], 1), tau([30, *range(1501, 1511)], 1), tau([0, *range(1701, 1711)], 0)])
+    assert a.row["additional"] == 3 and given[:2] == [("exploration", 30, [*range(31)])] * 2
+    assert sorted(given[2:]) == [("additional", 1003, [*range(31), 1001, 1002, 1003]),
+                                 ("additional", 1502, [*range(31), 1501, 1502])]
 
 
 def test_S4_1_09_prefix_negatives_unless_the_start_is_the_initial_cluster():
@@ -708,9 +743,9 @@ def test_S4_2_22_and_23_the_state_of_the_prefix_is_any_more_than_N_away(P):
         pairs = Pairs()
         pairs.add_trajectory("exploration", frames_of(range(1000, 1000 + T)), NEAR, rng)
         before = len(pairs.y)
-        pairs.add_prefix(frames_of(range(1000, 1000 + T)), list(frames_of(range(P))), NEAR, rng)
+        pairs.add_prefix("additional", frames_of(range(1000, 1000 + T)), list(frames_of(range(P))), NEAR, rng)
         new = labelled(pairs)[before:]
-        assert all(y == 0 for *_, y in new) and len(new) == pairs.counts["exploration prefix"]
+        assert all(y == 0 for *_, y in new) and len(new) == pairs.counts["additional prefix"]
         found.update((a, b) for a, b, _ in new)
     # Along the joined path state j of the prefix is the j-th, and state i of the trajectory is number P - 1 + i.
     agree(found, {1000 + i: [j for j in range(P) if (P - 1 + i) - j > 6] for i in range(T)})
@@ -831,7 +866,7 @@ def test_R17_every_pair_of_the_larger_class_can_be_drawn():
 
 def test_rates_are_of_as_many_pairs_as_the_smaller_class_has(monkeypatch):
     model, y, scored = SimilarityModel(MAZE, (32, 32)), np.array([1] * 30 + [0] * 12), []
-    monkeypatch.setattr(model, "score", lambda first, second: scored.append(len(first)) or np.ones(len(first)))
+    monkeypatch.setattr(model, "probability", lambda first, second: scored.append(len(first)) or torch.ones(len(first)))
     model.rates(Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y), np.random.default_rng(0))
     assert scored == [24]
 
@@ -1114,7 +1149,7 @@ def test_S4_01_S6_1_06_S6_1_11_M_trajectories_from_the_sampled_centres_within_th
 
 
 def test_S4_02_pairs_are_made_of_exploration_and_of_additional_trajectories(monkeypatch):
-    (a, tape), kept = explorer(env_fn=MAZE_FN), []
+    (a, tape), kept = explorer(replace(QUICK, prefix=False), MAZE_FN), []
     tape.wrap(monkeypatch, a, "train_similarity", note=kept.append)
     collect = a.collect
     monkeypatch.setattr(a, "collect", lambda purpose, *rest: kept.append(collect(purpose, *rest)) or kept[-1])
@@ -1422,13 +1457,13 @@ def test_S6_3_02_without_prefixes_the_rest_of_the_pairs_is_identical():
     twin.steps = a.steps
     assert any(tau.start for tau in taus)
     pairs = [run.make_pairs(taus) for run in (a, twin)]
-    prefixes = pairs[0].counts.pop("exploration prefix")
-    assert prefixes > 50 and pairs[0].counts == pairs[1].counts  # no pair of another kind comes or goes
+    of = [pairs[0].counts.pop(f"{source} prefix") for source in ("exploration", "additional")]
+    assert min(of) > 50 and pairs[0].counts == pairs[1].counts  # no pair of another kind comes or goes
 
     def plain(p):
         return Counter((p.states[i].tobytes(), p.states[j].tobytes(), y) for (i, j), y in zip(p.index, p.y.tolist(), strict=True))
     left = plain(pairs[0]) - plain(pairs[1])
-    assert not plain(pairs[1]) - plain(pairs[0]) and left.total() == prefixes and all(y == 0 for *_, y in left)
+    assert not plain(pairs[1]) - plain(pairs[0]) and left.total() == sum(of) and all(y == 0 for *_, y in left)
 
 
 def test_S6_3_03_only_theta_merge_differs(monkeypatch):
@@ -1557,7 +1592,7 @@ def test_R3_additional_trajectories_have_a_length_of_their_own_and_the_trace_tel
 
 
 def test_a_packed_state_holds_the_buffer_the_replayed_pairs_and_the_refusals():
-    config = replace(QUICK, keep_buffer=True, replay_iterations=1, max_clusters=6, beta=0.0)
+    config = replace(QUICK, keep_buffer=True, replay_iterations=1, max_clusters=3, beta=0.0)
     (a, _), (b, _) = explorer(config), explorer(config)
     while a.phase == "pretrain" or not a.graph.refused or not a.novel:
         a.iterate()
@@ -1598,10 +1633,10 @@ def test_verify_tells_places_apart_that_look_alike():
 
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_an_environment_of_the_users_own(channels):
-    a, tape = explorer(replace(QUICK, trim=2, max_clusters=6), functools.partial(Grid, channels))
+    a, tape = explorer(replace(QUICK, trim=2, max_clusters=2), functools.partial(Grid, channels))
     a.run()
     a.graph.check()
-    assert tape.rows()[-1]["coverage"] is None and 5 < tape.rows()[-1]["units"] <= 49 and len(a.graph.clusters) <= 6
+    assert tape.rows()[-1]["coverage"] is None and 5 < tape.rows()[-1]["units"] <= 49 and len(a.graph.clusters) <= 2
     assert a.graph.refused > 0
     assert a.similarity.encoder[0].in_channels == (channels or (1,))[0] and a.s_init.shape == (8, 8, *channels)
 
@@ -3104,8 +3139,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'memory_format=torch.channels_last)',
      'test_S4_1_01_R_is_a_probability_of_the_pair_alone'),
     ('S4.1-01', 'R is a logit',
-     'return torch.sigmoid(logits).squeeze(1).cpu().numpy()',
-     'return logits.squeeze(1).cpu().numpy()',
+     'return torch.sigmoid(self.head(torch.cat([first, second.expand_as(first)], dim=1))).squeeze(1)',
+     'return self.head(torch.cat([first, second.expand_as(first)], dim=1)).squeeze(1)',
      'test_S4_1_01_R_is_a_probability_of_the_pair_alone'),
     ('S4.1-02', 'partners from the first trajectory',
      'self._add(f"{source} positive", base + i, base + near, 1, rng)',
@@ -3164,9 +3199,25 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'self.config.prefix and tau.start is not None:',
      'test_S4_1_09_prefix_negatives'),
     ('S4.1-09', 'prefix pairs are positive',
-     'base + rng.integers(eligible[i]), 0, rng)',
-     'base + rng.integers(eligible[i]), 1, rng)',
+     'base + np.arange(len(i)), 0, rng)',
+     'base + np.arange(len(i)), 1, rng)',
      'test_S4_1_09_prefix_negatives'),
+    ('S4.1-09', 'additional trajectories have no prefix',
+     'tau.start, tau.since = met.start, met.frames[1 : i + 1]',
+     'pass',
+     'test_S4_1_09_the_prefix_of_an_additional'),
+    ('S4.1-09', 'the prefix of an additional trajectory is that of the first',
+     'met, i = origin[snapshot]',
+     'met, i = trajectories[0], origin[snapshot][1]',
+     'test_S4_1_09_the_prefix_of_an_additional'),
+    ('S4.1-09', 'the prefix of an additional trajectory ends with the centre',
+     'path.states() + list(tau.since)',
+     'path.states()',
+     'test_S4_1_09_the_prefix_of_an_additional'),
+    ('S4.1-09', 'the prefix of an additional trajectory ends before its first state',
+     'met.frames[1 : i + 1]',
+     'met.frames[1:i]',
+     'test_S4_1_09_the_prefix_of_an_additional'),
     ('S4.1-09', 'only the last link of the prefix',
      'self.graph.clusters[tau.start].path.states()',
      'list(self.graph.clusters[tau.start].path.frames[-1:])',
@@ -3348,8 +3399,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'np.clip(len(prefix) - 1 - config.N + 0 * i,',
      'test_S4_2_22_and_23'),
     ('S4.2-23', 'always s_init',
-     'base + rng.integers(eligible[i]), 0, rng)',
-     'base + 0 * i, 0, rng)',
+     '[prefix[j] for j in rng.integers(eligible[i])]',
+     '[prefix[0] for j in rng.integers(eligible[i])]',
      'test_S4_2_22_and_23'),
     ('S4.2-24', 'only clusters that an arc joins are tested',
      '            if scores[best] > theta:\n                self.absorb',
@@ -3576,8 +3627,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'frames.append(frame)',
      'test_where_actions'),
     ('R3', 'additional trajectories as long as others',
-     'for i in sample], self.config.additional_steps)',
-     'for i in sample], self.config.trajectory_steps)',
+     'sample, self.config.additional_steps)',
+     'sample, self.config.trajectory_steps)',
      'test_R3_'),
     ('trace', 'rewards of other states',
      'reward=reward[found].tolist()',
@@ -3607,6 +3658,22 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'head += [nn.BatchNorm1d(inputs), nn.ReLU(),',
      'head += [nn.ReLU(),',
      'test_R20_'),
+    ('R4', 'errors from before the training of their states',
+     'self.distance(part).cpu().numpy() for part in parts])))',
+     'part for part in errors])))',
+     'test_R4_pixels_are_clipped'),
+    ('R29', 'a state may be unlike itself',
+     'return torch.where(same, 1.0, self.probability(first, second)).cpu()',
+     'return self.probability(first, second).cpu()',
+     'test_R29_'),
+    ('R29', 'only to the last bit',
+     'rounding = 1e-5 *',
+     'rounding = 0 *',
+     'test_R29_'),
+    ('R29', 'one equal number of the embedding suffices',
+     '(first - second).abs().amax(1)',
+     '(first - second).abs().amin(1)',
+     'test_R29_'),
     ('R4', 'pixels are not clipped',
      '.clip(-5, 5)',
      '',
