@@ -593,8 +593,8 @@ class SimilarityModel(nn.Module):
         if not len(chosen):
             return {}
         first, second = map(self.embed, pairs.frames(chosen))
-        said, similar = self.probability(first, second).cpu().numpy() > 0.5, pairs.y[chosen] == 1
-        right = said == similar
+        said = self.probability(first, second).cpu().numpy() > 0.5
+        right, similar = said == pairs.y[chosen], pairs.y[chosen] == 1
         return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
                 "r_true_negative": float(right[~similar].mean())}
 
