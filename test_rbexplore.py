@@ -321,6 +321,8 @@ def test_rates_are_of_balanced_classes_and_each_of_its_own(monkeypatch):
     pairs = Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y)
     monkeypatch.setattr(model, "probability", lambda first, second: torch.ones(len(first)))
     assert model.rates(pairs, np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 1, "r_true_negative": 0}
+    monkeypatch.setattr(model, "probability", lambda first, second: torch.zeros(len(first)))  # of equal frames: no R29 in rates
+    assert model.rates(pairs, np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 0, "r_true_negative": 1}
 
 
 def test_R19_R_trains_epochs_passes_each_in_an_order_of_its_own(monkeypatch):
@@ -367,6 +369,12 @@ def test_R4_pixels_are_clipped_and_the_errors_of_all_states_counted_as_they_are_
     after = Moments(rnd.distance(np.concatenate(states)).detach().numpy())
     assert np.allclose([rnd.errors[-1].mean, rnd.errors[-1].m2], [after.mean, after.m2], rtol=1e-4)
     assert loss != pytest.approx(after.mean), "the loss is that of training"
+
+
+def test_R29_embeddings_of_equal_frames_are_not_rounded_to_tf32(monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    rbexplore.prepare(settings())
+    assert not torch.backends.cudnn.allow_tf32
 
 
 @pytest.mark.parametrize("scale", [0.01, 1, 100])
