@@ -359,24 +359,6 @@ def walk(env, snapshot: bytes, seed: list[int], steps: int, keep_snapshots: bool
     return Trajectory(np.stack(frames), snapshots if keep_snapshots else [], actions, units)
 
 
-def unit_key(unit) -> tuple:
-    """A coverage unit as a tuple of plain numbers or strings, whatever the environment makes it of."""
-    return tuple(np.ravel(unit).tolist())
-
-
-_worker = threading.local()  # an environment for each process, or thread, of an executor
-
-
-def walk_remotely(owner: tuple[str, Callable], job: tuple) -> Trajectory:
-    """`walk` in a worker, which makes an environment at its first job for this owner, and keeps it."""
-    if getattr(_worker, "owner", None) != owner[0]:
-        if getattr(_worker, "env", None):
-            _worker.env.close()
-        _worker.owner, _worker.env = owner[0], owner[1]()
-        _worker.env.reset()
-    return walk(_worker.env, *job)
-
-
 # -------------------------------------------------------------------- step 2: training pairs (4.1; S4.1-02 ... S4.1-09)
 
 
@@ -440,89 +422,6 @@ class Pairs:
 
 
 # --------------------------------------------------- step 3: the similarity model R (4.1, 6.1; S4.1-08, S6.1-02 ... 04)
-
-
-def to_input(frames: np.ndarray, device: str) -> torch.Tensor:
-    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1."""
-    x = torch.from_numpy(frames).to(device)
-    return (x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)).float() / 255
-
-
-class BasicBlock(nn.Module):
-    """The residual block of ResNet-18 (He et al. 2016)."""
-
-    def __init__(self, inputs: int, width: int, stride: int):
-        super().__init__()
-        self.residual = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(inplace=True),
-            nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
-        self.shortcut = nn.Sequential()
-        if stride > 1:
-            self.shortcut = nn.Sequential(nn.Conv2d(inputs, width, 1, stride, bias=False), nn.BatchNorm2d(width))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return F.relu(self.residual(x) + self.shortcut(x), inplace=True)
-
-
-class SpatialMean(nn.Module):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x.mean((2, 3))  # as AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA
-
-
-class Frugal(nn.Sequential):
-    """A Sequential that trains in less memory: it takes a batch in halves, the states s_1 and the states s_2, and has the
-    backward pass compute most activations anew, not kept (which moves BatchNorm's running statistics twice a batch)."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if not self.training:
-            return super().forward(x)
-        return torch.cat([checkpoint_sequential(self, 3, half, use_reentrant=False) for half in x.chunk(2)])
-
-
-def resnet18(channels: int, out: int) -> nn.Module:
-    """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
-    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
-    for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
-        layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
-    return Frugal(*layers, SpatialMean(), nn.Linear(512, out))
-
-
-SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding
-NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))  # Mnih et al. 2015, which Burda et al. 2019 use
-
-
-def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module:
-    """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
-    modules, (height, width), channels = [], shape[:2], channels_of(shape)
-    for planes, kernel, stride, pad in layers:
-        modules += [nn.Conv2d(channels, planes, kernel, stride, pad), *([nn.BatchNorm2d(planes)] if norm else []), nn.ReLU()]
-        height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
-        channels = planes
-    if min(height, width) < 1:
-        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: make them larger, or set encoder and "
-                         "rnd_encoder to small")
-    return nn.Sequential(*modules, nn.Flatten(), nn.Linear(channels * height * width, out))
-
-
-def channels_of(shape: tuple) -> int:
-    return shape[2] if len(shape) == 3 else 1
-
-
-def initialise(module: nn.Module, seed: int) -> nn.Module:
-    """He's initialisation, and biases of 0, from a generator of our own."""
-    generator = torch.Generator().manual_seed(seed)
-    for layer in module.modules():
-        if isinstance(layer, (nn.Conv2d, nn.Linear)):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
-            if layer.bias is not None:
-                nn.init.zeros_(layer.bias)
-    return module
-
-
-def finite(loss: torch.Tensor, what: str) -> float:
-    if not math.isfinite(loss.item()):
-        raise FloatingPointError(f"the loss of {what} is {loss.item()}: start again with a lower learning rate")
-    return loss.item()
 
 
 class SimilarityModel(nn.Module):
@@ -597,10 +496,6 @@ class SimilarityModel(nn.Module):
         right, similar = said == pairs.y[chosen], pairs.y[chosen] == 1
         return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
                 "r_true_negative": float(right[~similar].mean())}
-
-
-def chunks(frames: np.ndarray, size: int = 512) -> list[np.ndarray]:
-    return [frames[k : k + size] for k in range(0, len(frames), size)]
 
 
 # ----------------------------------------- step 4: the graph of clusters, prefixes, merge (4.2; S4.2-01 ... S4.2-29)
@@ -766,25 +661,6 @@ class Graph:
 # -------------------------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
 
 
-class Moments:
-    """Count, mean and variance of all batches so far, joined exactly (Chan et al. 1979), in float64."""
-
-    def __init__(self, batch: np.ndarray | None = None):
-        self.count, self.mean, self.m2 = 0, np.zeros(()), np.zeros(())
-        if batch is not None:  # (B, ...): moments of each entry
-            self.count, self.mean = len(batch), batch.mean(0, dtype=np.float64)
-            self.m2 = np.square(batch - self.mean).sum(0)
-
-    def join(self, other: "Moments") -> "Moments":
-        total, delta = self.count + other.count, other.mean - self.mean
-        self.m2 = self.m2 + other.m2 + delta**2 * (self.count * other.count / total)
-        self.mean, self.count = self.mean + delta * (other.count / total), total
-        return self
-
-    def standardise(self, x: np.ndarray) -> np.ndarray:
-        return (x - self.mean) / np.maximum(np.sqrt(self.m2 / max(self.count, 1)), 1e-8)
-
-
 class RND:
     """Random network distillation (Burda et al. 2019): a predictor learns the output of a fixed random target network; its
     error is large on states unlike those it was trained on."""
@@ -846,6 +722,135 @@ class RND:
         self.optimiser.step()
         finite(error.mean(), "RND")
         return error.detach().cpu().numpy()
+
+
+# ######################################################################################################################
+# What the five steps stand on: worker processes, running moments, and the layers of the networks (6.1, R18).
+# ######################################################################################################################
+
+
+def unit_key(unit) -> tuple:
+    """A coverage unit as a tuple of plain numbers or strings, whatever the environment makes it of."""
+    return tuple(np.ravel(unit).tolist())
+
+
+_worker = threading.local()  # an environment for each process, or thread, of an executor
+
+
+def walk_remotely(owner: tuple[str, Callable], job: tuple) -> Trajectory:
+    """`walk` in a worker, which makes an environment at its first job for this owner, and keeps it."""
+    if getattr(_worker, "owner", None) != owner[0]:
+        if getattr(_worker, "env", None):
+            _worker.env.close()
+        _worker.owner, _worker.env = owner[0], owner[1]()
+        _worker.env.reset()
+    return walk(_worker.env, *job)
+
+
+class Moments:
+    """Count, mean and variance of all batches so far, joined exactly (Chan et al. 1979), in float64."""
+
+    def __init__(self, batch: np.ndarray | None = None):
+        self.count, self.mean, self.m2 = 0, np.zeros(()), np.zeros(())
+        if batch is not None:  # (B, ...): moments of each entry
+            self.count, self.mean = len(batch), batch.mean(0, dtype=np.float64)
+            self.m2 = np.square(batch - self.mean).sum(0)
+
+    def join(self, other: "Moments") -> "Moments":
+        total, delta = self.count + other.count, other.mean - self.mean
+        self.m2 = self.m2 + other.m2 + delta**2 * (self.count * other.count / total)
+        self.mean, self.count = self.mean + delta * (other.count / total), total
+        return self
+
+    def standardise(self, x: np.ndarray) -> np.ndarray:
+        return (x - self.mean) / np.maximum(np.sqrt(self.m2 / max(self.count, 1)), 1e-8)
+
+
+def chunks(frames: np.ndarray, size: int = 512) -> list[np.ndarray]:
+    return [frames[k : k + size] for k in range(0, len(frames), size)]
+
+
+def to_input(frames: np.ndarray, device: str) -> torch.Tensor:
+    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1."""
+    x = torch.from_numpy(frames).to(device)
+    return (x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)).float() / 255
+
+
+class BasicBlock(nn.Module):
+    """The residual block of ResNet-18 (He et al. 2016)."""
+
+    def __init__(self, inputs: int, width: int, stride: int):
+        super().__init__()
+        self.residual = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(inplace=True),
+            nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
+        self.shortcut = nn.Sequential()
+        if stride > 1:
+            self.shortcut = nn.Sequential(nn.Conv2d(inputs, width, 1, stride, bias=False), nn.BatchNorm2d(width))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return F.relu(self.residual(x) + self.shortcut(x), inplace=True)
+
+
+class SpatialMean(nn.Module):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.mean((2, 3))  # as AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA
+
+
+class Frugal(nn.Sequential):
+    """A Sequential that trains in less memory: it takes a batch in halves, the states s_1 and the states s_2, and has the
+    backward pass compute most activations anew, not kept (which moves BatchNorm's running statistics twice a batch)."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if not self.training:
+            return super().forward(x)
+        return torch.cat([checkpoint_sequential(self, 3, half, use_reentrant=False) for half in x.chunk(2)])
+
+
+def resnet18(channels: int, out: int) -> nn.Module:
+    """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
+    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
+    for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
+        layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
+    return Frugal(*layers, SpatialMean(), nn.Linear(512, out))
+
+
+SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding
+NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))  # Mnih et al. 2015, which Burda et al. 2019 use
+
+
+def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module:
+    """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
+    modules, (height, width), channels = [], shape[:2], channels_of(shape)
+    for planes, kernel, stride, pad in layers:
+        modules += [nn.Conv2d(channels, planes, kernel, stride, pad), *([nn.BatchNorm2d(planes)] if norm else []), nn.ReLU()]
+        height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
+        channels = planes
+    if min(height, width) < 1:
+        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: make them larger, or set encoder and "
+                         "rnd_encoder to small")
+    return nn.Sequential(*modules, nn.Flatten(), nn.Linear(channels * height * width, out))
+
+
+def channels_of(shape: tuple) -> int:
+    return shape[2] if len(shape) == 3 else 1
+
+
+def initialise(module: nn.Module, seed: int) -> nn.Module:
+    """He's initialisation, and biases of 0, from a generator of our own."""
+    generator = torch.Generator().manual_seed(seed)
+    for layer in module.modules():
+        if isinstance(layer, (nn.Conv2d, nn.Linear)):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+    return module
+
+
+def finite(loss: torch.Tensor, what: str) -> float:
+    if not math.isfinite(loss.item()):
+        raise FloatingPointError(f"the loss of {what} is {loss.item()}: start again with a lower learning rate")
+    return loss.item()
 
 
 # ######################################################################################################################
