@@ -435,7 +435,7 @@ class SimilarityModel(nn.Module):
             small = config.encoder == "small"
             self.encoder = convolutions(shape, d, SMALL, norm=True) if small else resnet18(channels_of(shape), d)
             for inputs, outputs in ((2 * d, w), (w, w), (w, w), (w, 1)):
-                head += [nn.BatchNorm1d(inputs), nn.ReLU(), nn.Linear(inputs, outputs)]  # R20
+                head += [nn.BatchNorm1d(inputs), nn.ReLU(inplace=True), nn.Linear(inputs, outputs)]  # R20
             self.head = nn.Sequential(*head)
         initialise(self, config.seed).to(device, memory_format=torch.channels_last).eval()  # which is faster
         self.device, self.optimiser = device, torch.optim.Adam(self.parameters(), lr=config.r_learning_rate)
@@ -823,7 +823,8 @@ def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module
     """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
     modules, (height, width), channels = [], shape[:2], channels_of(shape)
     for planes, kernel, stride, pad in layers:
-        modules += [nn.Conv2d(channels, planes, kernel, stride, pad), *([nn.BatchNorm2d(planes)] if norm else []), nn.ReLU()]
+        modules.append(nn.Conv2d(channels, planes, kernel, stride, pad))
+        modules += [nn.BatchNorm2d(planes), nn.ReLU(inplace=True)] if norm else [nn.ReLU(inplace=True)]
         height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
         channels = planes
     if min(height, width) < 1:
@@ -1786,6 +1787,7 @@ def prepare(settings: dict):
     """Check the device, fix threads and determinism; return the algorithm and its executor."""
     torch.set_num_threads(settings["threads"])
     torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # nothing here reads such memory, and filling it takes time
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS wants for that
     torch.backends.cudnn.allow_tf32 = False  # whose rounding would hide that two embeddings are of equal frames (R29)
     try:
