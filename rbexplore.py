@@ -823,8 +823,7 @@ def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module
     """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
     modules, (height, width), channels = [], shape[:2], channels_of(shape)
     for planes, kernel, stride, pad in layers:
-        modules.append(nn.Conv2d(channels, planes, kernel, stride, pad))
-        modules += [nn.BatchNorm2d(planes), nn.ReLU(inplace=True)] if norm else [nn.ReLU(inplace=True)]
+        modules += [nn.Conv2d(channels, planes, kernel, stride, pad)] + [nn.BatchNorm2d(planes)] * norm + [nn.ReLU(inplace=True)]
         height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
         channels = planes
     if min(height, width) < 1:
