@@ -885,6 +885,13 @@ def test_R18_the_gradient_is_clipped_before_the_step():
     assert math.sqrt(sum(s["exp_avg"].square().sum().item() for s in model.optimiser.state.values())) < 1.001e-4
 
 
+def test_R18_a_relu_follows_each_convolution_and_R_alone_has_batch_normalisation():
+    nets = SimilarityModel(MAZE, (32, 32)).encoder, RND(MAZE, (32, 32)).target
+    kinds = [[type(layer).__name__ for layer in net] for net in nets]
+    assert kinds[0] == ["Conv2d", "BatchNorm2d", "ReLU"] * 3 + ["Flatten", "Linear"]
+    assert kinds[1] == ["Conv2d", "ReLU"] * 3 + ["Flatten", "Linear"]
+
+
 def test_R18_R20_widths_are_those_of_the_configuration():
     head = SimilarityModel(replace(MAZE, embedding=8, head_width=24), (32, 32)).head
     assert [m.in_features for m in head if isinstance(m, nn.Linear)] == [16, 24, 24, 24]
