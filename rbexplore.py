@@ -117,6 +117,7 @@ class Config:
     embedding: int = option(512, "size of a frame's embedding (6.1)", 1)
     head_width: int = option(512, "width of R's fully connected layers (R20)", 1)
     r_learning_rate: float = option(1e-4, "Adam's, for R (R18)", 0)
+    r_anneal: bool = option(False, "R's learning rate falls to 0 within each iteration, linearly (R18)")
     r_batch: int = option(256, "pairs in a batch (R18)", 2)
     r_clip: float = option(1.0, "bound on the norm of R's gradient (R18)", 0)
     rnd_encoder: str = option("nature", "network of RND (R18)", choices=("nature", "small"))
@@ -139,7 +140,7 @@ class Config:
 
 # The maze's: what a small image, a small budget and a CPU need; the rest is the paper's.
 MAZE = Config(steps=100_000, pretrain_steps=8_000, M=20, trajectory_steps=150, L=20, frame_size=32,
-              encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_batch=128,
+              encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_anneal=True, r_batch=128,
               rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3, rnd_batch=64)
 CONFIGS = {"paper": Config(), "maze": MAZE}
 
@@ -464,15 +465,18 @@ class SimilarityModel(nn.Module):
         return torch.where(same, 1.0, self.probability(first, second)).cpu().numpy()
 
     def fit(self, pairs: Pairs, config: Config, rng: np.random.Generator, tell: Callable) -> float | None:
-        """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs."""
+        """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs.
+        r_anneal lets the learning rate fall, so that the R that decides in step 4 hangs less on its last batches (R18)."""
         self.train()
         try:
             for epoch in range(config.epochs):
                 order, losses = pairs.balanced(rng), []
                 batches = np.array_split(order, math.ceil(len(order) / config.r_batch) or 1)
                 for k, batch in enumerate(batches if len(order) else []):
+                    done, total = epoch * len(batches) + k, config.epochs * len(batches)
+                    self.optimiser.param_groups[0]["lr"] = config.r_learning_rate * (1 - config.r_anneal * done / total)
                     losses.append(self.update(*pairs.frames(batch), pairs.y[batch], config.r_clip))
-                    tell("progress", step="train R", done=epoch * len(batches) + k + 1, total=config.epochs * len(batches))
+                    tell("progress", step="train R", done=done + 1, total=total)
         finally:
             self.eval()
         return float(np.mean(losses)) if losses else None

@@ -334,6 +334,17 @@ def test_R19_R_trains_epochs_passes_each_in_an_order_of_its_own(monkeypatch):
     assert len({b"".join(batches[k : k + 3]) for k in (0, 3, 6)}) == 3
 
 
+@pytest.mark.parametrize("anneal", [True, False])
+def test_R18_annealed_the_rate_of_R_falls_linearly_from_one_iteration_to_the_next(monkeypatch, anneal):
+    model, rates = SimilarityModel(MAZE, (32, 32)), []
+    pairs = Pairs(list(pictures(40)), np.stack([np.arange(40)] * 2, 1), np.arange(40) % 2)
+    monkeypatch.setattr(model, "update", lambda *_: rates.append(model.optimiser.param_groups[0]["lr"]) or 0.0)
+    for _ in range(2):  # iterations, of 2 passes over 4 batches
+        model.fit(pairs, replace(MAZE, r_anneal=anneal, r_learning_rate=0.8, epochs=2, r_batch=10), np.random.default_rng(0),
+                  lambda *_, **__: None)
+    assert rates == pytest.approx([0.8 - 0.1 * k * anneal for k in range(8)] * 2)
+
+
 def test_R18_the_norm_of_Rs_gradient_is_clipped_and_each_network_has_its_rate():
     config = replace(MAZE, r_learning_rate=0.5, rnd_learning_rate=0.25)
     model, rnd, x = SimilarityModel(config, (32, 32)), RND(config, (32, 32)), pictures(16)
@@ -1424,7 +1435,7 @@ def test_S6_1_13_theta_rises_linearly_from_0_in_pretraining_and_is_fixed_after(m
 
 
 def test_S6_1_14_S6_1_15_at_the_restart_G_is_reset_and_R_and_rnd_are_kept(monkeypatch):
-    a, tape = explorer(replace(SHORT, keep_buffer=True, beta=-9.0), MAZE_FN)  # beta: every state is novel
+    a, tape = explorer(replace(SHORT, keep_buffer=True, beta=-9.0, r_anneal=False), MAZE_FN)  # beta: every state is novel
 
     def kept():
         parts = a.similarity, a.novelty.predictor, a.novelty.target
@@ -3741,6 +3752,14 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'self.s_init = self.env.reset(seed=self.config.seed)[0].copy()\n        self.snap_init, self.unit_init',
      'self.s_init = self.env.reset()[0].copy()\n        self.snap_init, self.unit_init',
      'test_a_seeded'),
+    ('R18', "R's learning rate falls anew in each pass",
+     'config.r_anneal * done / total)',
+     'config.r_anneal * k / len(batches))',
+     'test_R18_annealed_the_rate_of_R_falls_linearly_from_one_iteration_to_the_next'),
+    ('R18', "R's learning rate does not fall",
+     'config.r_anneal * done / total)',
+     'config.r_anneal * 0)',
+     'test_R18_annealed_the_rate_of_R_falls_linearly_from_one_iteration_to_the_next'),
     ('R18', 'the gradient is clipped after the step',
      '        nn.utils.clip_grad_norm_(self.parameters(), clip)\n        self.optimiser.step()\n',
      '        self.optimiser.step()\n        nn.utils.clip_grad_norm_(self.parameters(), clip)\n',
