@@ -343,6 +343,7 @@ def test_R18_annealed_the_rate_of_R_falls_linearly_from_one_iteration_to_the_nex
         model.fit(pairs, replace(MAZE, r_anneal=anneal, r_learning_rate=0.8, epochs=2, r_batch=10), np.random.default_rng(0),
                   lambda *_, **__: None)
     assert rates == pytest.approx([0.8 - 0.1 * k * anneal for k in range(8)] * 2)
+    assert rbexplore.MAZE.r_anneal and not Config().r_anneal  # the authors' rate is constant
 
 
 def test_R18_the_norm_of_Rs_gradient_is_clipped_and_each_network_has_its_rate():
