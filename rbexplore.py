@@ -181,7 +181,7 @@ class RbExplore:
 
     def iterate(self) -> dict:
         """One iteration: the paper's five steps in the paper's order. Returns its metrics."""
-        self.check_budget()
+        check_budget(self)
         if self.phase == "pretrain" and self.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
@@ -194,19 +194,9 @@ class RbExplore:
         self.update_graph(trajectories)
         self.train_novelty(trajectories)
 
-        self.row |= self.counts() | {"clusters": len(self.graph.clusters)}
+        self.row |= counts(self) | {"clusters": len(self.graph.clusters)}
         self.tell("row", row=self.row)
         return self.row
-
-    def check_budget(self) -> None:
-        if self.steps >= self.config.steps:
-            raise InputError(f"the budget of {self.config.steps} steps is spent: give more steps to go on")
-
-    def counts(self) -> dict:
-        """Steps so far, and %Cov: units visited, of those of full coverage where these are known (5; S5-03)."""
-        full, units = getattr(self.env, "full_coverage", None), len(self.discovered)
-        return {"steps": self.steps, "exploration_steps": self.exploration_steps, "units": units,
-                "coverage": units / full if full else None}
 
     def restart(self) -> None:
         """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
@@ -232,8 +222,7 @@ class RbExplore:
         ids, probabilities = self.graph.sampling_distribution()
         chosen = self.rng("sample").choice(ids, size=self.config.M, p=probabilities).tolist()
         self.tell("sample", clusters=ids, probabilities=probabilities.tolist(), chosen=chosen)
-        snapshots = [self.graph.clusters[v].snapshot for v in chosen]
-        trajectories = self.collect("explore", snapshots, self.config.trajectory_steps)
+        trajectories = self.collect("explore", [self.graph.clusters[v].snapshot for v in chosen], self.config.trajectory_steps)
         for tau, v in zip(trajectories, chosen, strict=False):  # fewer, where the budget of steps ended
             tau.start = v
         return trajectories
@@ -248,11 +237,7 @@ class RbExplore:
             if len(todo) * steps > end - self.steps:  # they might not all fit: one at a time
                 todo = todo[:1]
             jobs = [(snapshots[k], self.seed(purpose, k), min(steps, end - self.steps), purpose == "explore") for k in todo]
-            if self.executor:
-                done = self.executor.map(walk_remotely, [(self.owner, self.env_fn)] * len(jobs), jobs)
-            else:
-                done = (walk(self.env, *job) for job in jobs)
-            for tau in done:
+            for tau in walks(self, jobs):
                 for unit in tau.units:
                     self.steps += 1
                     self.exploration_steps += purpose == "explore"
@@ -277,9 +262,8 @@ class RbExplore:
 
     def additional_trajectories(self, trajectories: list["Trajectory"]) -> list["Trajectory"]:
         """Put novel states into B, sample L of it, walk on from them (S4.2-15 ... S4.2-18). They serve R alone."""
-        if not self.config.keep_buffer:
-            self.novel = []
-        states = novel = 0
+        self.novel = self.novel if self.config.keep_buffer else []
+        before = len(self.novel)
         origin: dict[bytes, tuple[Trajectory, int]] = {}  # a novel state: the (latest) trajectory that met it, and where
         for k, tau in enumerate(trajectories):
             reward = self.novelty.reward(tau.frames)  # (T,)
@@ -288,22 +272,22 @@ class RbExplore:
             origin |= {tau.snapshots[i]: (tau, i) for i in found}
             if len(found):
                 self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
-            states, novel = states + len(reward), novel + len(found)
+        novel_share = (len(self.novel) - before) / sum(len(tau.frames) for tau in trajectories)
         sample = [self.novel[i] for i in self.rng("buffer").permutation(len(self.novel))[: self.config.L]]
         additional = self.collect("additional", sample, self.config.additional_steps)
         for tau, snapshot in zip(additional, sample, strict=False):  # fewer, where the budget of steps ended
             if snapshot in origin:  # else it is of an earlier iteration (keep_buffer), whose trajectories are gone
                 met, i = origin[snapshot]
                 tau.start, tau.since = met.start, met.frames[1 : i + 1]
-        self.row |= {"novel_share": novel / states, "additional": len(additional)}
+        self.row |= {"novel_share": novel_share, "additional": len(additional)}
         return additional
 
     def train_similarity(self, pairs: "Pairs") -> None:
         """Step 3: train R on this iteration's pairs (S4-03, S4-06); first measure it on them, while they are unseen."""
-        self.row |= self.similarity.rates(pairs, self.rng("rates"))
-        training = Pairs.joined([*self.replay, pairs]) if self.replay else pairs
+        self.row |= rates(self.similarity, pairs, self.rng("rates"))
+        training = Pairs.joined([*self.replay, pairs])  # `replay` keeps none by default (R19)
         self.row["r_loss"] = self.similarity.fit(training, self.config, self.rng("similarity"), self.tell)
-        self.replay.append(pairs)  # which keeps none by default (R19)
+        self.replay.append(pairs)
 
     def update_graph(self, trajectories: list["Trajectory"]) -> None:
         """Step 4: add the exploration trajectories to G; every 15th iteration then merge (S4-04, S6.1-10, S6.3-01)."""
@@ -484,22 +468,7 @@ class SimilarityModel(nn.Module):
     def update(self, first: np.ndarray, second: np.ndarray, y: np.ndarray, clip: float) -> float:
         """One step on a batch: frames (B, H, W) twice, labels (B,). Returns the loss: -y log R - (1 - y) log(1 - R)."""
         loss = F.binary_cross_entropy_with_logits(self(first, second), torch.from_numpy(y).float().to(self.device))
-        self.optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.parameters(), clip)
-        self.optimiser.step()
-        return finite(loss, "R")
-
-    def rates(self, pairs: Pairs, rng: np.random.Generator, most: int = 500) -> dict[str, float]:
-        """How often the network's R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
-        chosen = pairs.balanced(rng, most)
-        if not len(chosen):
-            return {}
-        first, second = map(self.embed, pairs.frames(chosen))
-        said = self.probability(first, second).cpu().numpy() > 0.5
-        right, similar = said == pairs.y[chosen], pairs.y[chosen] == 1
-        return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
-                "r_true_negative": float(right[~similar].mean())}
+        return descend(self.optimiser, loss, "R", clip)
 
 
 # ----------------------------------------- step 4: the graph of clusters, prefixes, merge (4.2; S4.2-01 ... S4.2-29)
@@ -684,8 +653,7 @@ class RND:
 
     def distance(self, frames: np.ndarray) -> torch.Tensor:
         """Frames (B, H, W) -> the predictor's mean squared error (B,), on pixels standardised and clipped to +-5 (R4)."""
-        x = torch.from_numpy(self.pixels.standardise(frames).clip(-5, 5).astype(np.float32)).to(self.device)
-        x = x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
+        x = channels_first(torch.from_numpy(self.pixels.standardise(frames).clip(-5, 5).astype(np.float32)).to(self.device))
         with torch.no_grad():
             goal = self.target(x)
         return (self.predictor(x) - goal).square().mean(1)
@@ -721,21 +689,49 @@ class RND:
     def update(self, frames: np.ndarray) -> np.ndarray:
         """One step of the predictor on a batch (B, H, W). Returns the errors before it (B,)."""
         error = self.distance(frames)
-        self.optimiser.zero_grad()
-        error.mean().backward()
-        self.optimiser.step()
-        finite(error.mean(), "RND")
+        descend(self.optimiser, error.mean(), "RND")
         return error.detach().cpu().numpy()
 
 
 # ######################################################################################################################
-# What the five steps stand on: worker processes, running moments, and the layers of the networks (6.1, R18).
+# What the five steps stand on: counts and rates, worker processes, running moments, the layers of the networks (6.1, R18).
 # ######################################################################################################################
+
+
+def check_budget(a) -> None:
+    if a.steps >= a.config.steps:
+        raise InputError(f"the budget of {a.config.steps} steps is spent: give more steps to go on")
+
+
+def counts(a) -> dict:
+    """Steps so far, and %Cov: units visited, of those of full coverage where these are known (5; S5-03)."""
+    full, units = getattr(a.env, "full_coverage", None), len(a.discovered)
+    return {"steps": a.steps, "exploration_steps": a.exploration_steps, "units": units,
+            "coverage": units / full if full else None}
+
+
+def rates(similarity: SimilarityModel, pairs: Pairs, rng: np.random.Generator, most: int = 500) -> dict[str, float]:
+    """How often the network's R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
+    chosen = pairs.balanced(rng, most)
+    if not len(chosen):
+        return {}
+    first, second = map(similarity.embed, pairs.frames(chosen))
+    right = (similarity.probability(first, second).cpu().numpy() > 0.5) == pairs.y[chosen]
+    similar = pairs.y[chosen] == 1
+    return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
+            "r_true_negative": float(right[~similar].mean())}
 
 
 def unit_key(unit) -> tuple:
     """A coverage unit as a tuple of plain numbers or strings, whatever the environment makes it of."""
     return tuple(np.ravel(unit).tolist())
+
+
+def walks(a: RbExplore, jobs: list[tuple]):
+    """`walk` for each job, in their order: here, or in the executor's workers."""
+    if a.executor:
+        return a.executor.map(walk_remotely, [(a.owner, a.env_fn)] * len(jobs), jobs)
+    return (walk(a.env, *job) for job in jobs)
 
 
 _worker = threading.local()  # an environment for each process, or thread, of an executor
@@ -776,8 +772,11 @@ def chunks(frames: np.ndarray, size: int = 512) -> list[np.ndarray]:
 
 def to_input(frames: np.ndarray, device: str) -> torch.Tensor:
     """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1."""
-    x = torch.from_numpy(frames).to(device)
-    return (x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)).float() / 255
+    return channels_first(torch.from_numpy(frames).to(device)).float() / 255
+
+
+def channels_first(x: torch.Tensor) -> torch.Tensor:
+    return x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
 
 
 class BasicBlock(nn.Module):
@@ -851,9 +850,15 @@ def initialise(module: nn.Module, seed: int) -> nn.Module:
     return module
 
 
-def finite(loss: torch.Tensor, what: str) -> float:
+def descend(optimiser: torch.optim.Optimizer, loss: torch.Tensor, what: str, clip: float | None = None) -> float:
+    """One step of the optimiser down the loss, its gradient clipped at the norm `clip`. Returns the loss before it."""
     if not math.isfinite(loss.item()):
         raise FloatingPointError(f"the loss of {what} is {loss.item()}: start again with a lower learning rate")
+    optimiser.zero_grad()
+    loss.backward()
+    if clip is not None:
+        nn.utils.clip_grad_norm_([w for group in optimiser.param_groups for w in group["params"]], clip)
+    optimiser.step()
     return loss.item()
 
 
@@ -869,7 +874,6 @@ class Baseline:
     interface that the run folder uses. A subclass has advance(): spend the steps of one iteration, and learn from them."""
 
     run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
-    counts, check_budget = RbExplore.counts, RbExplore.check_budget
     parts, moments = (), ()  # networks and optimisers, and statistics, which a checkpoint keeps
 
     def __init__(self, env_fn: Callable, config: Config):
@@ -882,12 +886,12 @@ class Baseline:
 
     def iterate(self) -> dict:
         """One iteration. Returns its metrics."""
-        self.check_budget()
+        check_budget(self)
         self.iteration += 1
         self.row = {"iteration": self.iteration, "phase": self.phase}
         self.tell("iteration", **self.row)
         self.advance()
-        self.row |= self.counts()
+        self.row |= counts(self)
         self.tell("row", row=self.row)
         return self.row
 
@@ -992,10 +996,8 @@ class ICM(nn.Module):
     def update(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> dict[str, float]:
         """A step on equation 7, whose policy term is PPO's own."""
         inverse, forward = (loss.mean() for loss in self.losses(before, actions, after))
-        self.optimiser.zero_grad()
-        ((1 - self.beta) * inverse + self.beta * forward).backward()
-        self.optimiser.step()
-        return {"inverse_loss": finite(inverse, "ICM's inverse model"), "forward_loss": finite(forward, "ICM's forward model")}
+        descend(self.optimiser, (1 - self.beta) * inverse + self.beta * forward, "ICM")
+        return {"inverse_loss": inverse.item(), "forward_loss": forward.item()}
 
 
 def gae(rewards, values, last, ended, at_end, gamma: float, lam: float, episodic: bool) -> np.ndarray:
@@ -1106,11 +1108,7 @@ class PPO(Baseline):
         ratio = (new[range(len(actions)), actions] - logp).exp()
         gain = torch.min(ratio * advantages, ratio.clamp(1 - p.clip, 1 + p.clip) * advantages).mean()
         value_loss, entropy = (values - targets).square().mean(), -(new.exp() * new).sum(1).mean()
-        self.optimiser.zero_grad()
-        loss = p.value_weight * value_loss - gain - p.entropy * entropy
-        loss.backward()
-        self.optimiser.step()
-        finite(loss, "PPO")
+        descend(self.optimiser, p.value_weight * value_loss - gain - p.entropy * entropy, "PPO")
         return {"value_loss": value_loss.item(), "entropy": entropy.item()}
 
 
@@ -1120,11 +1118,14 @@ class Cells(nn.Module):
     def __init__(self, embed: Callable):
         super().__init__()
         self.embed, self.optimiser = embed, nn.Identity()  # nothing is trained: both have an empty state_dict
-        self.fit, self.rates = lambda *unused: None, lambda *unused: {}
+        self.fit = lambda *unused: None
+
+    def probability(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+        """Cells (K, d) and (K, d) or (d,) -> (K,)."""
+        return (first == second).all(1).double()
 
     def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-        """Cells (K, d) and (K, d) or (d,) -> (K,)."""
-        return (first == second).all(1).double().numpy()
+        return self.probability(first, second).numpy()
 
 
 def coarse(frames: np.ndarray) -> torch.Tensor:
@@ -1344,23 +1345,21 @@ class Run:
         elif self.tracing:
             self.events.append({"event": event, **data})
 
-    COLUMNS = "  iter phase        steps  clusters   new merged   %Cov R's loss    acc    TPR    TNR  novel     s    left"
+    COLUMNS = (  # heading, width, name in the row, format
+        ("iter", 6, "iteration", "d"), ("phase", 8, "phase", "s"), ("steps", 9, "steps", ",d"), ("clusters", 8, "clusters", "d"),
+        ("new", 5, "added", "d"), ("merged", 6, "merged", "d"), ("%Cov", 6, "coverage", ".1%"), ("R's loss", 8, "r_loss", ".3f"),
+        ("acc", 5, "r_accuracy", ".3f"), ("TPR", 5, "r_true_positive", ".3f"), ("TNR", 5, "r_true_negative", ".3f"),
+        ("novel", 6, "novel_share", ".1%"), ("s", 6, "seconds", ".1f"))
 
     def show(self, row: dict) -> None:
         """A line for an iteration."""
         before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
         pace = sum(r["seconds"] for r in self.rows[-5:]) / max(1, row["steps"] - before)
         left = round(pace * (self.settings["config"]["steps"] - row["steps"]))
-        cells = [f"{row['iteration']:6} {row['phase']:8} {row['steps']:9,} {row.get('clusters', '-'):>9} "
-                 f"{row.get('added', '-'):>5}{row.get('merged', '-'):>7}"]
-        rates = [(name, 6, 3, 1) for name in ("r_accuracy", "r_true_positive", "r_true_negative")]
-        for name, width, digits, scale in (("coverage", 6, 1, 100), ("r_loss", 8, 3, 1), *rates, ("novel_share", 6, 1, 100)):
-            value = row.get(name)
-            cells.append(f"{'-' if value is None else format(value * scale, f'.{digits}f'):>{width}}")
+        cells = [f"{'-' if row.get(name) is None else format(row[name], form):>{width}}" for _, width, name, form in self.COLUMNS]
         if row["coverage"] is None:
-            cells[1] = f"{row['units']:>5}u"
-        cells.append(f"{row['seconds']:5.1f} {left // 60:4}:{left % 60:02}")
-        print(("\r" if self.live else "") + " ".join(cells), flush=True)
+            cells[6] = f"{row['units']:>5}u"
+        print(("\r" if self.live else "") + " ".join(cells) + f" {left // 60:4}:{left % 60:02}", flush=True)
         if row["phase"] == "explore":
             for name, what in (("r_true_positive", "every state new"), ("r_true_negative", "every state known")):
                 if row.get(name) is not None and row[name] < 0.2:
@@ -1887,7 +1886,8 @@ def header(run: Run) -> str:
     begin = f", from step {a.steps:,} on" if a.steps else ""
     return (f"{s['method']} on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} "
             f"of them pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
-            f"torch {s['versions']['torch']}; run folder {run.folder}\n{Run.COLUMNS}")
+            f"torch {s['versions']['torch']}; run folder {run.folder}\n"
+            + " ".join(f"{heading:>{width}}" for heading, width, *_ in Run.COLUMNS) + "    left")
 
 
 def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:

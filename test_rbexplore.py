@@ -111,8 +111,8 @@ class Stub:
         self.scored += len(first)
         return self.R(first.squeeze(-1).numpy(), second.squeeze(-1).numpy())  # (K,)
 
-    def rates(self, pairs, rng):
-        return {}
+    def probability(self, first, second):
+        return torch.from_numpy(self.R(first.squeeze(-1).numpy(), second.squeeze(-1).numpy()))
 
     def fit(self, pairs, config, rng, tell):
         return None
@@ -319,10 +319,11 @@ def test_S4_1_07_classes_are_balanced():
 def test_rates_are_of_balanced_classes_and_each_of_its_own(monkeypatch):
     model, y = SimilarityModel(MAZE, (32, 32)), np.array([1] * 30 + [0] * 12)
     pairs = Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y)
+    rates = functools.partial(rbexplore.rates, model, pairs)
     monkeypatch.setattr(model, "probability", lambda first, second: torch.ones(len(first)))
-    assert model.rates(pairs, np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 1, "r_true_negative": 0}
+    assert rates(np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 1, "r_true_negative": 0}
     monkeypatch.setattr(model, "probability", lambda first, second: torch.zeros(len(first)))  # of equal frames: no R29 in rates
-    assert model.rates(pairs, np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 0, "r_true_negative": 1}
+    assert rates(np.random.default_rng(0)) == {"r_accuracy": 0.5, "r_true_positive": 0, "r_true_negative": 1}
 
 
 def test_R19_R_trains_epochs_passes_each_in_an_order_of_its_own(monkeypatch):
@@ -419,7 +420,7 @@ def test_S4_1_07_R_learns_that_1_means_close():
     e = model.embed(bars)
     near, far = model.score(e[:-2], e[2:]), model.score(e[:-13], e[13:])
     assert near.mean() > 0.8 and far.mean() < 0.2
-    rates = model.rates(pairs, rng)
+    rates = rbexplore.rates(model, pairs, rng)
     assert min(rates.values()) > 0.8 and rates["r_accuracy"] == (rates["r_true_positive"] + rates["r_true_negative"]) / 2
 
 
@@ -887,7 +888,7 @@ def test_R17_every_pair_of_the_larger_class_can_be_drawn():
 def test_rates_are_of_as_many_pairs_as_the_smaller_class_has(monkeypatch):
     model, y, scored = SimilarityModel(MAZE, (32, 32)), np.array([1] * 30 + [0] * 12), []
     monkeypatch.setattr(model, "probability", lambda first, second: scored.append(len(first)) or torch.ones(len(first)))
-    model.rates(Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y), np.random.default_rng(0))
+    rbexplore.rates(model, Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), y), np.random.default_rng(0))
     assert scored == [24]
 
 
@@ -965,7 +966,7 @@ def test_R18_rnds_batches_mix_the_states_of_trajectories(monkeypatch):
 @pytest.mark.parametrize("bad", [float("inf"), float("nan")])
 def test_a_loss_that_is_not_finite_stops(bad):
     with pytest.raises(FloatingPointError):
-        rbexplore.finite(torch.tensor(bad), "R")
+        rbexplore.descend(None, torch.tensor(bad), "R")
 
 
 def test_the_R_of_a_new_cluster_is_the_best_there_was():
@@ -1193,7 +1194,7 @@ def test_S4_02_pairs_are_made_of_exploration_and_of_additional_trajectories(monk
 def test_S4_03_S4_04_S4_05_the_five_steps_are_called_in_the_papers_order(monkeypatch):
     a, tape = explorer(replace(QUICK, merge_every=1, pretrain_steps=0))
     a.iterate()
-    parts = [("RND", a.novelty, "reward update"), ("R", a.similarity, "rates update"),
+    parts = [("RND", a.novelty, "reward update"), ("R", rbexplore, "rates"), ("R", a.similarity, "update"),
              ("G", Graph, "embed_centres add_trajectory merge")]
     tape.wrap(monkeypatch, a, "collect", note=lambda purpose, *_: purpose)
     for part, owner, names in parts:
@@ -1253,9 +1254,9 @@ def test_S4_06_no_pair_and_no_novel_state_outlives_its_iteration(monkeypatch, it
         found = sum(len(e["states"]) for e in tape.of("novel")[before:])
         novel = found + (novel if config.keep_buffer else 0)
         assert len(a.novel) == novel or a.phase == "explore"
-        (trained, mine), recent = (tape.noted("fit")[-1], given[-1]), given[-1 - iterations :]
+        trained, recent = tape.noted("fit")[-1], given[-1 - iterations :]
         assert [s.tobytes() for s in trained.states] == [s.tobytes() for p in recent for s in p.states]
-        assert len(trained.y) == sum(len(p.y) for p in recent) and (trained is mine) == (len(recent) == 1)
+        assert len(trained.y) == sum(len(p.y) for p in recent) and sum(trained.y) == sum(sum(p.y) for p in recent)
     assert len(given) > 4
 
 
@@ -1288,7 +1289,7 @@ def test_a_seeded_environment_begins_where_the_seed_says():
 def test_R19_rates_are_of_pairs_that_R_has_not_trained_on(monkeypatch):
     (a, tape), given = explorer(replace(QUICK, replay_iterations=1), MAZE_FN), []
     tape.wrap(monkeypatch, a, "train_similarity", note=given.append)
-    tape.wrap(monkeypatch, a.similarity, "rates", note=lambda pairs, *_: pairs)
+    tape.wrap(monkeypatch, rbexplore, "rates", note=lambda model, pairs, *_: pairs)
     for _ in range(3):
         a.iterate()
     assert all(x is y for x, y in zip(tape.noted("rates"), given, strict=True))
@@ -1917,12 +1918,12 @@ def test_resume_refuses_what_it_would_not_follow(finished, tmp_path, capsys, oth
 
 @pytest.mark.parametrize("what", ["R", "RND"])
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(what, tmp_path, monkeypatch, capsys):
-    calls, inner = itertools.count(), rbexplore.finite
+    calls, inner = itertools.count(), rbexplore.descend
     stop = 60 if what == "R" else 12
 
-    def spoil(loss, name):
-        return inner(loss * float("nan") if name == what and next(calls) == stop else loss, name)
-    monkeypatch.setattr(rbexplore, "finite", spoil)
+    def spoil(optimiser, loss, name, *clip):
+        return inner(optimiser, loss * float("nan") if name == what and next(calls) == stop else loss, name, *clip)
+    monkeypatch.setattr(rbexplore, "descend", spoil)
     assert main([*TINY_RUN, "--out", str(tmp_path), "--no-figures"]) == 2
     err, rows = capsys.readouterr().err, metrics(tmp_path)
     assert err == f"rbexplore: the loss of {what} is nan: start again with a lower learning rate\n" and rows
@@ -3350,7 +3351,7 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      "        goal = self.target(x)\n        self.optimiser.param_groups[0]['params'] = [*self.predictor.parameters(), *self.target.parameters()]\n",  # noqa: E501
      'test_S4_2_14_the_reward_falls_on_states_trained_on'),
     ('S4.2-14', 'the predictor is not trained',
-     '        error.mean().backward()\n        self.optimiser.step()\n',
+     '        descend(self.optimiser, error.mean(), "RND")\n',
      '',
      'test_S4_2_14_the_reward_falls_on_states_trained_on'),
     ('S4.2-14', 'statistics over all history',
@@ -3386,12 +3387,12 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'if self.phase == "explore"',
      'test_S4_2_18_additional_trajectories_serve_R_alone'),
     ('S4.2-18', 'RND trains on additional states',
-     '        self.row |= {"novel_share": novel / states, "additional"',
-     '        self.novelty.fit([t.frames for t in additional] or [self.s_init[None]], self.rng("novelty"), self.tell)\n        self.row |= {"novel_share": novel / states, "additional"',  # noqa: E501
+     '        self.row |= {"novel_share": novel_share, "additional"',
+     '        self.novelty.fit([t.frames for t in additional] or [self.s_init[None]], self.rng("novelty"), self.tell)\n        self.row |= {"novel_share": novel_share, "additional"',  # noqa: E501
      'test_S4_2_18_additional_trajectories_serve_R_alone'),
     ('S4.2-18', 'additional trajectories join G',
-     '        self.row |= {"novel_share": novel / states, "additional"',
-     '        for t in additional:\n            t.start, t.snapshots = 0, [self.snap_init] * len(t.frames)\n        trajectories += additional\n        self.row |= {"novel_share": novel / states, "additional"',  # noqa: E501
+     '        self.row |= {"novel_share": novel_share, "additional"',
+     '        for t in additional:\n            t.start, t.snapshots = 0, [self.snap_init] * len(t.frames)\n        trajectories += additional\n        self.row |= {"novel_share": novel_share, "additional"',  # noqa: E501
      'test_S4_2_18_additional_trajectories_serve_R_alone'),
     ('S4.2-19', 'the parent is always the start cluster',
      '                parent, parent_at = cluster, i  #',
@@ -3542,8 +3543,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'maxlen=self.config.replay_iterations + 1)',
      'test_S4_06_'),
     ('S4-06', 'B persists',
-     '        if not self.config.keep_buffer:\n',
-     '        if False:\n',
+     'self.novel = self.novel if self.config.keep_buffer else []',
+     'self.novel = self.novel',
      'test_S4_06_'),
     ('S5-03', 'additional trajectories count as coverage',
      'if purpose == "explore" and self.phase == "explore" and unit is not None:',
@@ -3678,8 +3679,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'pairs.y[chosen] == 0\n',
      'test_rates'),
     ('R18', "R's gradient is not clipped",
-     '        nn.utils.clip_grad_norm_(self.parameters(), clip)\n',
-     '',
+     '        nn.utils.clip_grad_norm_([w for group in optimiser.param_groups for w in group["params"]], clip)\n',
+     '        pass\n',
      'test_R18_'),
     ('R20', 'no batch normalisation in the head',
      'head += [nn.BatchNorm1d(inputs), nn.ReLU(inplace=True),',
@@ -3762,23 +3763,23 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      'config.r_anneal * 0)',
      'test_R18_annealed_the_rate_of_R_falls_linearly_from_one_iteration_to_the_next'),
     ('R18', 'the gradient is clipped after the step',
-     '        nn.utils.clip_grad_norm_(self.parameters(), clip)\n        self.optimiser.step()\n',
-     '        self.optimiser.step()\n        nn.utils.clip_grad_norm_(self.parameters(), clip)\n',
+     '    if clip is not None:\n        nn.utils.clip_grad_norm_([w for group in optimiser.param_groups for w in group["params"]], clip)\n    optimiser.step()\n',  # noqa: E501
+     '    optimiser.step()\n    if clip is not None:\n        nn.utils.clip_grad_norm_([w for group in optimiser.param_groups for w in group["params"]], clip)\n',  # noqa: E501
      'test_R18_the_gradient'),
     ('R18', "RND's size is fixed",
      'if config.rnd_encoder == "small" else NATURE, config.rnd_features\n        with',
      'if config.rnd_encoder == "small" else NATURE, 512\n        with',
      'test_R18_R20'),
     ('R19', 'rates of pairs that R knows',
-     'self.similarity.rates(pairs, self.rng("rates"))',
-     'self.similarity.rates(Pairs.joined([*self.replay, pairs]), self.rng("rates"))',
+     'rates(self.similarity, pairs, self.rng("rates"))',
+     'rates(self.similarity, Pairs.joined([*self.replay, pairs]), self.rng("rates"))',
      'test_R19_rates'),
     ('S4.2-20', 'a prefix keeps its whole trajectory in memory',
      'tau.frames[since].copy()',
      'tau.frames[since]',
      'test_a_prefix_does'),
     ('S6.2-04', 'a spent budget is not noticed',
-     "paper's order. Returns its metrics.\"\"\"\n        self.check_budget()\n",
+     "paper's order. Returns its metrics.\"\"\"\n        check_budget(self)\n",
      "paper's order. Returns its metrics.\"\"\"\n",
      'test_no_method_iterates'),
     ('S5-03', 'coverage keeps last visits',
@@ -3786,8 +3787,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      '            self.discovered[unit_key(unit)] = self.steps\n        return frame',
      'test_baselines_record'),
     ('S6.2-03', "ICM's losses exchange their weights",
-     '((1 - self.beta) * inverse + self.beta * forward).backward()',
-     '(self.beta * inverse + (1 - self.beta) * forward).backward()',
+     '(1 - self.beta) * inverse + self.beta * forward,',
+     'self.beta * inverse + (1 - self.beta) * forward,',
      'test_icm_beta'),
     ('S6.2-03', 'the oracle always plays level 1',
      'functools.partial(ExactMaze, maze.level, maze.frame_size)',
