@@ -982,6 +982,82 @@ def test_check_finds_a_loop():
         graph.check()
 
 
+def test_rates_of_at_most_500_of_each_class(monkeypatch):
+    model, scored = SimilarityModel(MAZE, (32, 32)), []
+    monkeypatch.setattr(model, "probability", lambda first, second: scored.append(len(first)) or torch.ones(len(first)))
+    pairs = Pairs(list(pictures(2)), np.zeros((1200, 2), np.int64), np.arange(1200) % 2)
+    rbexplore.rates(model, pairs, np.random.default_rng(0))
+    assert scored == [1000]
+
+
+def test_he_initialisation():
+    for net in (SimilarityModel(Config(), (96, 96)), RND(Config(), (96, 96)).predictor):
+        for layer in net.modules():
+            if isinstance(layer, (nn.Conv2d, nn.Linear)):
+                fan_in, count = layer.weight[0].numel(), layer.weight.numel()
+                if count > 5000:
+                    assert layer.weight.std().item() == pytest.approx(math.sqrt(2 / fan_in), rel=0.05)
+                assert layer.bias is None or not layer.bias.any()
+
+
+def test_R29_rounding_is_of_each_embedding_itself():
+    model = SimilarityModel(MAZE, (32, 32))
+    first = torch.zeros(2, MAZE.embedding)
+    first[0], first[1] = 1e4, 1.0
+    assert (model.score(first, first[1] + 1e-3) < 1).all()
+
+
+def test_each_pass_draws_from_the_larger_class_anew(monkeypatch):
+    model, seen = SimilarityModel(MAZE, (32, 32)), set()
+    pairs = Pairs(list(pictures(42)), np.stack([np.arange(42)] * 2, 1), np.array([1] * 30 + [0] * 12))
+    monkeypatch.setattr(model, "update", lambda first, second, y, clip: seen.update(f.tobytes() for f in first) or 0.0)
+    model.fit(pairs, replace(MAZE, epochs=30), np.random.default_rng(0), lambda *_, **__: None)
+    assert len(seen) == 42
+
+
+def test_the_layers_of_resnet18_and_of_a_block():
+    def kinds(net):
+        return [type(layer).__name__ for layer in net]
+    net = rbexplore.resnet18(1, 512)
+    assert kinds(net) == ["Conv2d", "BatchNorm2d", "ReLU", "MaxPool2d"] + ["BasicBlock"] * 8 + ["SpatialMean", "Linear"]
+    assert kinds(net[4].residual) == ["Conv2d", "BatchNorm2d", "ReLU", "Conv2d", "BatchNorm2d"]
+    x = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(rbexplore.SpatialMean()(x), x.flatten(2).mean(2))
+
+
+def test_the_layers_of_rnd_are_burdas():
+    rnd = RND(Config(), (96, 96))
+    convs = [(m.out_channels, m.kernel_size[0], m.stride[0], m.padding[0]) for m in rnd.target if isinstance(m, nn.Conv2d)]
+    assert convs == [(32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0)]
+    assert [type(m).__name__ for m in rnd.predictor[1:]] == ["ReLU", "Linear", "ReLU", "Linear"]
+
+
+def test_R3_R18_R19_values_of_the_readings():
+    paper = {"additional_steps": 50, "r_learning_rate": 1e-4, "r_batch": 256, "r_clip": 1.0, "rnd_learning_rate": 1e-4,
+             "epochs": 4, "novelty_window": 5, "head_width": 512, "rnd_encoder": "nature", "rnd_features": 512, "rnd_batch": 256}
+    assert paper.items() <= asdict(Config()).items()
+
+
+def test_the_pixels_statistics_come_before_the_training(monkeypatch):
+    rnd, counts = RND(MAZE, (32, 32)), []
+    monkeypatch.setattr(rnd, "update", lambda frames: counts.append(rnd.pixels.count) or np.zeros(len(frames)))
+    rnd.fit([pictures(8)], np.random.default_rng(0), lambda *_, **__: None)
+    assert counts == [8]
+
+
+def test_R_trains_in_training_mode_and_its_gradients_are_those_of_the_batch(monkeypatch):
+    model, x, modes, grads = SimilarityModel(replace(MAZE, r_learning_rate=0.0), (32, 32)), pictures(16), [], []
+    model.train()
+    for _ in range(2):
+        model.update(x[:8], x[8:], np.arange(8) % 2, 1e9)
+        grads.append([p.grad.clone() for p in model.parameters()])
+    model.eval()
+    monkeypatch.setattr(model, "update", lambda *_: modes.append(model.training) or 0.0)
+    model.fit(Pairs(list(x), np.zeros((8, 2), np.int64), np.arange(8) % 2), MAZE, np.random.default_rng(0), lambda *_, **__: None)
+    assert all(modes)
+    assert all(torch.allclose(p, q, rtol=1e-3, atol=1e-6) for p, q in zip(*grads, strict=True))
+
+
 # ------------------------------------------------------------ the loop, the run folder, the environments
 
 TINY = replace(MAZE, steps=4000, pretrain_steps=600, M=4, L=3, trajectory_steps=60, additional_steps=40, merge_every=3)
@@ -1334,6 +1410,27 @@ def test_a_death_on_a_blank_frame_ends_the_trajectory():
 def test_additional_trajectories_keep_no_snapshots():
     a = explorer()[0]
     assert all(not t.snapshots for t in a.collect("additional", [a.snap_init] * 2, 30))
+
+
+def test_sample_differs_between_iterations():
+    a, asked = algorithm(M=40), []
+    a.graph, _ = grow([(0, [0, 10, 20, 30])])
+    a.collect = lambda purpose, snapshots, steps: asked.append(tuple(snapshots)) or []
+    for a.iteration in range(3):
+        a.explore()
+    assert len(set(asked)) == 3
+
+
+def test_R28_iterations_of_pretraining_count_for_the_merge(monkeypatch):
+    a, tape = explorer(replace(QUICK, merge_every=4, L=0, steps=3000))
+    tape.wrap(monkeypatch, Graph, "merge", note=lambda *_: (a.phase, a.iteration))
+    a.run()
+    rows = tape.rows()
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+    assert tape.noted("merge") == [(row["phase"], row["iteration"]) for row in rows if row["iteration"] % 4 == 0]
+    assert {phase for phase, _ in tape.noted("merge")} == {"pretrain", "explore"}
+    last = max(row["iteration"] for row in rows if row["phase"] == "pretrain")
+    assert last % 4, "else the merges after the restart are the same, counted from it"
 
 
 # ------------------------------------------------------------------------------ the domain and the experiments (5, 6)
@@ -1701,6 +1798,13 @@ def test_learning_gate():
     assert np.mean([row["r_accuracy"] for row in tape.rows()[-5:]]) > 0.7
 
 
+def test_a_packed_state_holds_the_next_number():
+    (a, _), (b, _) = explorer(), explorer()
+    a.graph.created = 9  # the clusters made last were merged away
+    rbexplore.unpack(b, through_a_file(rbexplore.pack(a)))
+    assert b.graph.created == 9
+
+
 # ------------------------------------------------------------------------------------ the run folder, the command line
 
 SCRIPT = rbexplore.__file__
@@ -2051,6 +2155,60 @@ def test_no_warning_in_pretraining(tmp_path, capsys):
         assert ("warning" in capsys.readouterr().out) == (phase == "explore")
 
 
+def test_a_resume_writes_the_metrics_of_its_checkpoint(tmp_path):
+    line = ["--method", "random", "--steps", "6000", "--no-figures", "--out", str(tmp_path / "run")]
+    killed_at(9, line)  # between checkpoint.pt and metrics.csv of the last iteration
+    assert len(metrics(tmp_path / "run")) == 2
+    assert main(["--resume", str(tmp_path / "run"), "--no-figures"]) == 0
+    assert len(metrics(tmp_path / "run")) == 3
+
+
+def test_a_map_colours_the_units_visited():
+    drawing = (np.zeros((20, 40, 3), np.uint8), {(0,): (0, 0, 10, 10), (1,): (30, 10, 10, 10)}, [])
+    axes = rbexplore.maps_figure(drawing, {"title": {(1,): 7}}, 9).axes[0]
+    heat = np.ma.filled(axes.images[1].get_array(), np.nan)
+    assert (heat[10:20, 30:40] == 7).all() and np.isnan(heat).sum() == 20 * 40 - 100
+    assert [list(line.get_xdata()) for line in axes.lines] == [[0, 10]]
+
+
+@pytest.mark.parametrize("after, centre", [(b"", (6, 6)), (b"\2", (6, 5))])
+def test_verify_knows_that_an_episode_ended(after, centre):
+    a, _ = explorer()
+    picture, root = a.env.restore(bytes(centre)), a.graph.clusters[0].path
+    actions = b"\1" * 6 + b"\3" * 6 + after  # into the corner that kills, and on
+    a.graph.clusters[1] = rbexplore.Cluster(picture, bytes(centre), rbexplore.Path(root, picture[None], (actions,)), 0)
+    assert not rbexplore.verify(a)[1]
+
+
+def test_threads_are_those_asked_for():
+    before = torch.get_num_threads()
+    try:
+        rbexplore.prepare(settings("--threads", "2"))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_algorithms_are_deterministic():
+    torch.use_deterministic_algorithms(False)
+    rbexplore.prepare(settings())
+    assert torch.are_deterministic_algorithms_enabled()
+
+
+def test_the_summary_tells_per_cent(tmp_path):
+    run = rbexplore.Run(tmp_path, settings(), make_method("random", MAZE_FN, BRIEF).run())
+    share = 100 * len(run.algorithm.discovered) / 187
+    assert f"{len(run.algorithm.discovered)} of 187 tiles ({share:.1f} %)" in rbexplore.summary(run, [], 1.0, False)
+
+
+def test_rooms_without_a_drawing():
+    picture, boxes, labels = rbexplore.rooms_map({(3, 4, 7), (3, 6, 7), (5, 4, 8)})
+    assert len({box[:2] for box in boxes.values()}) == 3 and len(labels) == 2
+    (a, b), side = (boxes[3, 4, 7], boxes[3, 6, 7]), 12
+    assert (b[0] - a[0], b[1] - a[1]) == (2 * side, 0)
+    assert all(x >= 0 and x + w <= picture.shape[1] and y >= 0 and y + h <= picture.shape[0] for x, y, w, h in boxes.values())
+
+
 # ----------------------------------------------------------------------------------------------------------- the maze
 
 
@@ -2224,6 +2382,38 @@ def test_a_maze_keeps_few_frames():
     for snapshot in env.distances(env.snapshot()):
         env.restore(snapshot)
     assert len(env._seen) <= 4096
+
+
+def test_luminance_of_the_maze():
+    env = Maze(frame_size=96)
+    frame, slow = env.reset()[0], np.floor(env._picture(9, 32).astype(int) @ np.array([77, 150, 29]) / 256)
+    assert np.array_equal(frame[:, 3:93], slow) and not frame[:, :3].any() and not frame[:, 93:].any()
+
+
+def test_frames_given_away_are_the_users_own():
+    env = Maze()
+    frame = env.reset()[0]
+    frame[:] = 0
+    assert env.reset()[0].any() and env.restore(env.snapshot()).any()
+
+
+def test_frames_show_which_way_the_agent_faces():
+    env = Maze()
+    right = env.reset()[0]
+    left = env.step(envs.LEFT)[0]
+    assert not np.array_equal(left, right)
+
+
+def test_no_snapshot_in_mid_air():
+    env = Maze()
+    x, y = next((line.index("."), y) for y, line in enumerate(env.tiles) if "." in line)
+    with pytest.raises(InputError, match="snapshot"):
+        env.restore(bytes((1, x, y, 1, 0, 0)))
+
+
+def test_an_open_gate_shows_less_than_a_closed_one():
+    shut, opened = (Maze(frame_size=96)._paint_room(4, plates, 9, 32) for plates in (0, 1))
+    assert (shut == envs.STEEL).all(2).sum() - (opened == envs.STEEL).all(2).sum() > 50
 
 
 # ------------------------------------------- the emulators, on a stand-in cartridge whose program runs in the real emulator
@@ -2649,6 +2839,22 @@ def test_the_cartridge_refuses_what_it_cannot_use(rom, prince, tmp_path):
 
 def test_full_coverage_of_every_level_of_the_cartridge():
     assert PrinceOfPersia.FULL_COVERAGE == (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
+
+
+def test_a_snapshot_taken_after_a_restore_is_the_same(prince):
+    first = prince.snapshot()
+    for _ in range(5):
+        frame = prince.step(2)[0]
+    second = prince.snapshot()
+    assert not np.array_equal(prince.restore(first), frame)
+    assert prince.snapshot() == first != second
+
+
+def test_R22_the_last_frame_of_a_step(montezuma):
+    montezuma.reset()
+    for action in np.random.default_rng(0).integers(18, size=100).tolist():
+        frame = montezuma.step(action)[0]
+        assert np.array_equal(frame, montezuma._observe())
 
 
 # ------------------------------------------------------------------------------------------ the methods compared (6.2, 6.3)
@@ -3084,6 +3290,47 @@ def test_an_experiments_map_is_that_of_the_best_run(tmp_path, monkeypatch):
     assert main(["--experiment", "methods", "--seeds", "2", "--steps", "600", "--out", str(tmp_path)]) == 0
     state = torch.load(tmp_path / "random-1" / "checkpoint.pt", weights_only=True)["algorithm"]
     assert list(given[0].values()) == [{tuple(unit): step for unit, step in state["discovered"]}]
+
+
+def test_R27_the_values_are_burdas_and_pathaks():
+    paper = {"actors": 128, "rollout_steps": 128, "episode_steps": 4500, "stack": 4, "gamma": 0.99, "gae_lambda": 0.95,
+             "episodic": False, "learning_rate": 1e-4, "passes": 4, "minibatches": 4, "clip": 0.1, "entropy": 0.001,
+             "value_weight": 0.5, "standardise": False, "bonus_share": 0.25, "hidden": 448, "icm_beta": 0.2}
+    assert asdict(PPO_CONFIGS["paper"]) == paper
+
+
+def test_value_weight_weighs_the_values_error():
+    a = PPO(Corridor, BRIEF, "cpu", replace(TINY_PPO, value_weight=0.0, entropy=0.0), Goal)
+    a.update(a.seen[:2], np.array([0, 1]), np.full(2, -0.7), np.zeros(2), np.full(2, 9.0))
+    assert not any(w.grad.any() for w in a.net.parameters())
+
+
+def test_the_first_policy_is_uniform_and_the_first_values_are_0():
+    a = PPO(Corridor, BRIEF, "cpu", TINY_PPO, Goal)
+    logp, values = a.act(np.random.default_rng(0).integers(256, size=(20, 32, 32, 1), dtype=np.uint8))
+    assert (logp.exp() - 0.5).abs().max() < 0.02 and values.abs().max() < 0.05
+
+
+def test_actions_are_a_sample_of_the_policy():
+    class Endless(Corridor):
+        def step(self, action):
+            return self.restore(b"\2"), 0.0, False, False, {}
+    a = PPO(Endless, replace(BRIEF, steps=10_000), "cpu", replace(TINY_PPO, actors=1, rollout_steps=4000), Goal)
+    a.net[-1].weight.data *= 0
+    a.net[-1].bias.data[:2] = torch.tensor([0.9, 0.1]).log()
+    actions = a.rollout()[1]
+    assert abs((actions == 0).mean() - 0.9) < 0.025
+
+
+def test_the_value_after_the_rollout_is_that_of_the_state_it_ends_in():
+    a = PPO(Corridor, BRIEF, "cpu", TINY_PPO, Goal)
+    a.net[-1].bias.data[-1] = 2.0
+    last = a.rollout()[5]
+    assert np.allclose(last, a.act(a.seen)[1].detach(), atol=1e-5) and (last > 1).all()
+
+
+def test_three_runs_unless_told():
+    assert {seed for _, seed in runs_of(parser().parse_args(["--experiment", "ablation"]))} == {0, 1, 2}
 
 
 # ------------------------------------------------------------------------------------------------- the README tells the truth
