@@ -1,7 +1,6 @@
 """Environments that can be rolled back (paper 3.2 and 5): the contract, a small maze, the emulators, the factory.
 
-Exploring with rollbacks asks two things of an environment beyond Gymnasium's interface: take a snapshot of the complete state,
-and restore it. Coverage units (paper 5) are for metrics and figures only."""
+Beyond Gymnasium's interface they save and restore their complete state. Coverage units are for metrics and figures only."""
 
 import gzip
 import inspect
@@ -24,7 +23,8 @@ class PersistentEnv(gymnasium.Env):
     """A Gymnasium environment whose states can be saved and returned to: a persistent MDP (paper 3.2).
 
     observation_space is a Box of uint8 (H, W), grayscale; action_space is Discrete. Rewards are ignored. Where `step` reports
-    info["blank"] = True, the frame is a transition screen and no state (R24): it is stepped and counted, but never a centre."""
+    info["blank"] = True, the frame is a transition screen and no state (R24): it is stepped and counted, but never a centre.
+    A level_map(), if any, is for figures: the level (H, W, 3) uint8 and each unit's box (left, top, width, height) in pixels."""
 
     full_coverage: int | None = None  # number of units of full coverage (paper 5), None where it is not known
     unit_name = "units"  # what a unit is, printed beside every coverage (reading R26)
@@ -39,33 +39,34 @@ class PersistentEnv(gymnasium.Env):
         raise NotImplementedError
 
     def unit(self) -> tuple[int, ...] | None:
-        """The coverage unit in which the agent stands (5), None where its position is invalid or it is dead. For metrics only:
-        the algorithm never sees it."""
+        """The coverage unit in which the agent stands (5), None where it is in none or dead. The algorithm never sees it."""
         raise NotImplementedError
-
-    def level_map(self) -> tuple[np.ndarray, dict[tuple[int, ...], tuple[int, int, int, int]]] | None:
-        """For figures: the level as (H, W, 3) uint8 and each unit's box (left, top, width, height) in pixels."""
-        return None
 
 
 def check_contract(env) -> None:
     """Raise InputError, saying what is wrong, unless `env` is a persistent environment as PersistentEnv describes it."""
-    names = ("reset", "step", "snapshot", "restore", "unit", "close")
-    missing = [name for name in names if not callable(getattr(env, name, None))]
-    if missing:
-        raise InputError(f"the environment lacks {', '.join(missing)}(): see PersistentEnv in envs.py; of a wrapped "
-                         "environment give env.unwrapped")
+    names = ["reset", "step", "snapshot", "restore", "unit", "close"]
+    if missing := [name for name in names if not callable(getattr(env, name, None))]:
+        raise InputError(f"the environment lacks {', '.join(missing)}(), see envs.py; of a wrapped one give env.unwrapped")
     actions, frames = getattr(env, "action_space", None), getattr(env, "observation_space", None)
     if not isinstance(actions, gymnasium.spaces.Discrete) or actions.n > 256:
         raise InputError(f"the action space is {actions}: it must be Discrete with at most 256 actions")
     if not isinstance(frames, gymnasium.spaces.Box) or frames.dtype != np.uint8 or len(frames.shape) not in (2, 3):
         raise InputError(f"the observation space is {frames}: it must be a Box of uint8, (H, W) or (H, W, C)")
-    frame = np.array(env.reset()[0])
-    if frame.shape != frames.shape or frame.dtype != np.uint8:
-        raise InputError(f"reset() gives a frame {frame.shape} of {frame.dtype}: it must be as the observation space says")
-    snapshot = env.snapshot()
-    if not isinstance(snapshot, bytes) or not np.array_equal(env.restore(snapshot), frame):
-        raise InputError("snapshot() must give bytes, and restore() of them the same frame again: see PersistentEnv in envs.py")
+    after, walked = np.array(env.reset()[0]), []
+    for action in np.random.default_rng(0).integers(actions.n, size=20).tolist():
+        if after.shape != frames.shape or after.dtype != np.uint8:
+            raise InputError(f"a frame is {after.shape} of {after.dtype}: it must be as the observation space says")
+        walked.append((env.snapshot(), after, action + int(actions.start)))
+        frame, _, terminated, truncated, _ = env.step(walked[-1][-1])
+        after = np.array(frame)
+        if terminated or truncated:
+            break
+    for snapshot, frame, action in walked[::-1]:
+        back = isinstance(snapshot, bytes) and np.array_equal(env.restore(snapshot), frame)
+        if not back or not np.array_equal(env.step(action)[0], after):
+            raise InputError("snapshot() must give bytes, and restore() the same frame and future: see PersistentEnv in envs.py")
+        after = frame
 
 
 # ---- The maze: a side-view level in the spirit of the Prince of Persia (paper 5) ---------------------------------
@@ -448,9 +449,8 @@ class PrinceOfPersia(EmulatorEnv):
 
 class Montezuma(EmulatorEnv):
     """Montezuma's Revenge through ale-py, which brings the game: not in the paper, but needs no cartridge.
-    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames, which a chain of rollbacks
-    would reach. ALE's minimal set of actions: here all 18. No full coverage set is known. info: room, x, y (ALE pixels) and
-    lives, and "blank"."""
+    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames, which rollbacks would
+    reach. ALE's minimal actions, all 18. No full coverage set is known. info: room, x, y (ALE pixels), lives, "blank"."""
 
     unit_name = "units of 16 x 16 pixels"
 

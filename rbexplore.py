@@ -29,8 +29,8 @@ unclear. The README lists both.
 
 import argparse
 import copy
-import csv
 import functools
+import io
 import itertools
 import json
 import math
@@ -66,7 +66,7 @@ except ImportError:  # Windows has none
 # ---------------------------------------------------------------------------- configuration (6.1; S6.1-05, 08, 09, 12)
 
 
-def option(default, meaning, low=None, high=None, choices=None):
+def option(default, meaning, low=-10**9, high=10**9, choices=None):
     """A field of the configuration: its meaning is the text of --help, its range is checked."""
     return field(default=default, metadata={"meaning": meaning, "low": low, "high": high, "choices": choices})
 
@@ -78,10 +78,8 @@ def check_fields(config) -> None:
         types = (int, float) if f.type is float else f.type
         if not isinstance(value, types) or isinstance(value, bool) and f.type is not bool:
             raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
-        if f.type is float and not math.isfinite(value):
-            raise InputError(f"{f.name} is {value}: give a finite number")
-        if low is not None and value < low or high is not None and value > high:
-            raise InputError(f"{f.name} is {value}: give {f'a number from {low} to {high}' if high else f'at least {low}'}")
+        if f.type in (int, float) and not low <= value <= high:
+            raise InputError(f"{f.name} is {value}: give a number from {low:,} to {high:,}")
         if choices and value not in choices:
             raise InputError(f"{f.name} is {value!r}: choose {' or '.join(choices)}")
 
@@ -164,7 +162,7 @@ class RbExplore:
         self.env, self.owner = env_fn(), f"{os.getpid()}.{next(_owners)}"
         check_contract(self.env)
         self.s_init = self.env.reset(seed=self.config.seed)[0].copy()
-        self.snap_init, self.unit_init = self.env.snapshot(), self.env.unit()
+        self.snap_init, self.unit_init = self.env.snapshot(), unit_key(self.env.unit())
         self.similarity = SimilarityModel(self.config, self.s_init.shape, device)
         self.novelty = RND(self.config, self.s_init.shape, device)
         self.graph = Graph(self.s_init, self.snap_init, self.config)
@@ -202,7 +200,7 @@ class RbExplore:
         """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
         self.phase, self.novel, self.graph = "explore", [], Graph(self.s_init, self.snap_init, self.config)
         if self.unit_init is not None:
-            self.discovered[unit_key(self.unit_init)] = self.steps
+            self.discovered[self.unit_init] = self.steps
         self.tell("restart")
 
     def theta_sim(self) -> float:
@@ -722,9 +720,14 @@ def rates(similarity: SimilarityModel, pairs: Pairs, rng: np.random.Generator, m
             "r_true_negative": float(right[~similar].mean())}
 
 
-def unit_key(unit) -> tuple:
-    """A coverage unit as a tuple of plain numbers or strings, whatever the environment makes it of."""
-    return tuple(np.ravel(unit).tolist())
+def unit_key(unit) -> tuple | None:
+    """A coverage unit as a tuple of plain numbers or strings, or None."""
+    try:
+        key = None if unit is None else tuple(np.ravel(unit).tolist())
+        hash(key)
+    except (TypeError, ValueError):
+        raise InputError(f"unit() gives {unit!r}: it must give a number, a string, a tuple of them, or None") from None
+    return key
 
 
 def walks(a: RbExplore, jobs: list[tuple]):
@@ -880,9 +883,9 @@ class Baseline:
         self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
         check_contract(self.env)
         self.s_init = self.env.reset(seed=config.seed)[0].copy()
-        self.snap_init, unit = self.env.snapshot(), self.env.unit()
+        self.snap_init, unit = self.env.snapshot(), unit_key(self.env.unit())
         self.iteration = self.steps = self.exploration_steps = 0
-        self.discovered: dict[tuple, int] = {} if unit is None else {unit_key(unit): 0}
+        self.discovered: dict[tuple, int] = {} if unit is None else {unit: 0}
 
     def iterate(self) -> dict:
         """One iteration. Returns its metrics."""
@@ -1246,6 +1249,7 @@ def unpack(a: RbExplore | Baseline, state: dict) -> None:
     for start, end, visits in state["arcs"]:
         g.add_arc(start, end, visits)
     g.created, g.assigned, g.refused = state["graph"]
+    g.check()
 
 
 def memory(a: RbExplore) -> float:
@@ -1261,13 +1265,28 @@ def memory(a: RbExplore) -> float:
 
 
 def write_atomically(path: pathlib.Path, write: Callable) -> None:
-    """A reader finds the old file or the new one and never half of one, also after a kill."""
-    temporary = path.with_name(path.name + ".new")
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    """A reader finds the old file or the new one and never half of one, also after a kill, or where the disk is full."""
+    temporary, content = path.with_name(path.name + ".new"), io.BytesIO()
+    write(content)  # not to the file: torch has an error of its own for a full disk
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def load_checkpoint(folder: pathlib.Path, use: Callable):
+    """What `use` makes of the checkpoint in the folder; InputError where it cannot."""
+    path = folder / "checkpoint.pt"
+    try:
+        return use(torch.load(path, map_location="cpu", weights_only=True))  # load_state_dict moves what must move
+    except Exception as error:  # torch raises many kinds for a file that is cut short
+        raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
+                         "another --out") from None
 
 
 class Run:
@@ -1284,32 +1303,33 @@ class Run:
         if (self.folder / "config.json").exists():
             raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
         self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "trace.jsonl").unlink(missing_ok=True)  # of a run killed before it had begun
         self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
         write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
 
     def load(self) -> None:
         """Take the state of the last complete iteration from the checkpoint; writes nothing."""
-        path = self.folder / "checkpoint.pt"
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)  # load_state_dict moves what must move
-            self.rows, settings, self.trace_bytes = state["rows"], state["settings"], state["trace_bytes"]
+        def take(state: dict) -> bool:
+            rows, trace_bytes, settings = list(state["rows"]), state["trace_bytes"], state["settings"]
             same = all(settings[key] == self.settings[key] for key in ("method", "ppo", "env", "options", "config", "threads"))
             if same:
                 unpack(self.algorithm, state["algorithm"])
-        except Exception as error:  # torch raises many kinds for a file that is cut short
-            raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
-                             "another --out") from None
-        if not same:
-            raise InputError(f"{path} is of another configuration than config.json beside it: put the right one back, or "
-                             "begin anew with another --out")
+                self.rows, self.trace_bytes = rows, trace_bytes
+            return same
+
+        if not load_checkpoint(self.folder, take):
+            raise InputError(f"{self.folder / 'checkpoint.pt'} is of another configuration than config.json beside it: put the "
+                             "right one back, or begin anew with another --out")
 
     def resume(self) -> None:
         """Go on from the last complete iteration; what came after it is forgotten."""
         self.load()
+        trace, self.events = self.folder / "trace.jsonl", []
+        if self.tracing and self.trace_bytes > (trace.stat().st_size if trace.exists() else 0):
+            raise InputError(f"{trace} is missing or cut short: put the whole file back, or begin anew with another --out")
         self.write_metrics()
         if self.tracing:
-            self.events = []
-            with open(self.folder / "trace.jsonl", "ab") as file:
+            with open(trace, "ab") as file:
                 file.truncate(self.trace_bytes)
 
     def save(self) -> None:
@@ -1628,7 +1648,7 @@ def runs_of(args: argparse.Namespace) -> dict[tuple[str, int], list[str]]:
     for name, value in vars(args).items():
         if value is not None and name not in ("experiment", "seeds", "seed", "out", "trace", "profile", "no_figures"):
             flag = name.replace("_", "-")
-            shared += [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+            shared += [(f"--{flag}" if value else f"--no-{flag}") if isinstance(value, bool) else f"--{flag}={value}"]
     out = args.out or f"runs/{args.experiment}-{env}"
     return {(variant, seed): [*shared, *own, "--seed", str(seed), "--out", f"{out}/{variant}-{seed}"]
             for seed in range(first, first + (args.seeds or 3)) for variant, own in EXPERIMENTS[args.experiment].items()
@@ -1642,9 +1662,9 @@ def execute(command: list[str]) -> str:
         free = {"versions": 0, "workers": 0}  # may differ
         if recorded_settings(str(folder), parser().parse_args([])) | free != settings | free:
             raise InputError(f"{folder} holds a run of another configuration: choose another --out")
-        with open(folder / "metrics.csv") as file:
-            if max((int(row["steps"]) for row in csv.DictReader(file)), default=0) >= settings["config"]["steps"]:
-                return f"{folder} was finished"
+        steps = load_checkpoint(folder, lambda state: max((row["steps"] for row in state["rows"]), default=0))
+        if steps >= settings["config"]["steps"]:
+            return f"{folder} was finished"
         command = ["--resume", str(folder), "--no-figures", "--workers", str(settings["workers"])]
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "log.txt", "a") as log:
@@ -1656,10 +1676,9 @@ def execute(command: list[str]) -> str:
 
 def experiment(args: argparse.Namespace) -> int:
     """All runs, side by side where there are cores; then curves.csv with all curves, the figures, and a line for each run."""
-    if args.seeds is not None and args.seeds < 1:
-        raise InputError(f"seeds is {args.seeds}: give 1 or more")
     runs = runs_of(args)
     settings = [settings_of(parser().parse_args(command)) for command in runs.values()][0]  # all: an error shows before any run
+    env, grid = make_env(settings["env"], **settings["options"]), np.linspace(0, settings["config"]["steps"], 201).astype(int)
     with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // (args.workers or 1))) as pool:
         try:
             for line in pool.map(execute, runs.values()):
@@ -1668,11 +1687,10 @@ def experiment(args: argparse.Namespace) -> int:
             pool.shutdown(cancel_futures=True)
             raise
     out = pathlib.Path(next(iter(runs.values()))[-1]).parent
-    env, grid = make_env(settings["env"], **settings["options"]), np.linspace(0, settings["config"]["steps"], 201).astype(int)
     full, found, curves = env.full_coverage, {}, {}
     for (variant, seed), command in runs.items():
-        state = torch.load(pathlib.Path(command[-1]) / "checkpoint.pt", map_location="cpu", weights_only=True)["algorithm"]
-        found[variant, seed] = {tuple(unit): step for unit, step in state["discovered"]}
+        discovered = load_checkpoint(pathlib.Path(command[-1]), lambda state: state["algorithm"]["discovered"])
+        found[variant, seed] = {tuple(unit): step for unit, step in discovered}
         times = sorted(found[variant, seed].values())
         curves.setdefault(variant, {})[seed] = coverage_curve(found[variant, seed], grid, full)
         unit = f"%; steps to 50, 90, 100 %: {', '.join(s or '-' for s in steps_to(times, full).values())}" if full else "units"
@@ -1748,8 +1766,8 @@ def settings_of(args: argparse.Namespace) -> dict:
     paths = {name: getattr(args, name) and os.path.abspath(getattr(args, name)) for name in ("rom", "state")}
     options = {name: value for name, value in ({"level": args.level} | paths).items() if value is not None}
     for name in ("threads", "workers"):
-        if getattr(args, name) is not None and getattr(args, name) < 1:
-            raise InputError(f"{name} is {getattr(args, name)}: give 1 or more")
+        if getattr(args, name) is not None and not 1 <= getattr(args, name) <= 1000:
+            raise InputError(f"{name} is {getattr(args, name)}: give a number from 1 to 1,000")
     return {"method": method, "ppo": asdict(replace(PPO_CONFIGS[base], **ppo)), "env": env,
             "options": options | {"frame_size": config.frame_size}, "config": asdict(config), "device": args.device or "cpu",
             "threads": args.threads or 1, "workers": args.workers or 1, "versions": versions()}
@@ -1768,7 +1786,9 @@ def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
         fixed = {"level": 1, "rom": None, "state": None, "out": folder} | settings["options"] | settings["config"]
         fixed |= settings["ppo"] | {name: settings[name] for name in ("method", "env", "device", "threads")}
         recorded = settings["workers"], settings["versions"]
-    except (OSError, ValueError, KeyError, TypeError):
+        if not all(isinstance(settings[name], int) and settings[name] > 0 for name in ("threads", "workers")):
+            raise ValueError
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path} cannot be read: there is no run in {folder}; see what --out was") from None
     if args.config:
         raise InputError("--config goes with a new run: a resumed run keeps its options; leave it out")
@@ -1794,7 +1814,7 @@ def prepare(settings: dict):
     torch.backends.cudnn.allow_tf32 = False  # whose rounding would hide that two embeddings are of equal frames (R29)
     try:
         torch.zeros(1, device=settings["device"]).cpu()
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(f"device {settings['device']} cannot be used ({reason}): give another --device, such as cpu") from None
     try:
@@ -1823,15 +1843,25 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenProcessPool:
         print("rbexplore: a worker process died, of memory perhaps: go on with --resume and fewer --workers", file=sys.stderr)
         return 2
+    except MemoryError:
+        print("rbexplore: out of memory: give smaller values, of M, frame_size or actors for example", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return 130
 
 
 def command(args: argparse.Namespace) -> int:
+    for name, value in vars(args).items():
+        if value == "":
+            raise InputError(f"--{name.replace('_', '-')} is empty: give a value, or leave it out")
     if sum(map(bool, (args.experiment, args.resume, args.verify))) > 1:
         raise InputError("--experiment, --resume and --verify exclude each other: give one of them")
-    if args.export_demos and not args.verify:
-        raise InputError("--export-demos goes with --verify RUN")
+    if args.export_demos and not (args.verify and args.export_demos.endswith(".npz")):
+        raise InputError("--export-demos goes with --verify RUN, and FILE ends in .npz")
+    if args.seeds is not None and not (args.experiment and args.seeds > 0):
+        raise InputError(f"seeds is {args.seeds}: give 1 or more, with --experiment")
+    if args.experiment and args.method:
+        raise InputError("--experiment chooses the methods: leave --method out")
     if args.experiment and (args.trace or args.profile):
         raise InputError("--trace and --profile go with a single run, not with --experiment: leave them out")
     if not args.no_figures and not args.verify:
@@ -1843,7 +1873,7 @@ def command(args: argparse.Namespace) -> int:
     started = time.monotonic()
     algorithm, executor = prepare(settings)
     folder = pathlib.Path(old or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
-    run = Run(folder, settings, algorithm, args.trace or (folder / "trace.jsonl").exists())
+    run = Run(folder, settings, algorithm, args.trace or bool(old) and (folder / "trace.jsonl").exists())
     if args.verify:
         return verified(run, args.export_demos)
     profile = Profile(algorithm, run) if args.profile else None  # which may refuse, before there is a folder
@@ -1886,7 +1916,7 @@ def header(run: Run) -> str:
     begin = f", from step {a.steps:,} on" if a.steps else ""
     return (f"{s['method']} on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} "
             f"of them pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
-            f"torch {s['versions']['torch']}; run folder {run.folder}\n"
+            f"torch {torch.__version__}; run folder {run.folder}\n"
             + " ".join(f"{heading:>{width}}" for heading, width, *_ in Run.COLUMNS) + "    left")
 
 

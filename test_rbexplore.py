@@ -1089,7 +1089,7 @@ class Grid(PersistentEnv):
 
     def step(self, action):
         self.calls.append(action)
-        x, y = np.add(self.place, [(-1, 0), (1, 0), (0, -1), (0, 1)][action]).clip(0, 6).tolist()
+        x, y = np.add(self.place, [(-1, 0), (1, 0), (0, -1), (0, 1)][action % 4]).clip(0, 6).tolist()
         self.place = x, y
         reward = self.rewards.normal() * 1e6 if self.rewards else 0.0
         return self.frame(), reward, self.place == (6, 6), self.place == (0, 6), {"blank": x == 5}
@@ -1495,6 +1495,7 @@ def test_S6_1_07_a_death_ends_the_trajectory_and_is_no_state(monkeypatch):
 
 def test_R24_blank_frames_are_counted_and_replayed_but_are_no_states():
     a, _ = explorer()
+    a.env.calls.clear()
     tau = rbexplore.walk(a.env, bytes((4, 3)), [0], 200, True)
     assert len(tau.units) == len(a.env.calls) and any(u[0] == 5 for u in tau.units)
     assert len(tau.frames) == len(tau.snapshots) == len(tau.actions) < len(tau.units) and tau.frames.any((1, 2)).all()
@@ -1771,8 +1772,8 @@ def test_an_environment_of_the_users_own(channels):
     ({"action_space": gymnasium.spaces.Box(0, 1)}, "must be Discrete"),
     ({"action_space": gymnasium.spaces.Discrete(257)}, "at most 256"),
     ({"observation_space": gymnasium.spaces.Box(0, 1, (8, 8))}, "Box of uint8"),
-    ({"frame": lambda: np.zeros((9, 9), np.uint8)}, "gives a frame"),
-    ({"frame": lambda: np.zeros((8, 8))}, "gives a frame"), ({"restore": lambda s: np.ones((8, 8), np.uint8)}, "same frame"),
+    ({"frame": lambda: np.zeros((9, 9), np.uint8)}, "a frame is"),
+    ({"frame": lambda: np.zeros((8, 8))}, "a frame is"), ({"restore": lambda s: np.ones((8, 8), np.uint8)}, "same frame"),
     ({"snapshot": lambda: "00"}, "must give bytes")])
 def test_an_environment_that_breaks_the_contract(change, said):
     def broken():
@@ -1967,17 +1968,19 @@ def check_refused(capsys, tmp_path, argv, said):
     assert before == {p: p.is_file() and p.read_bytes() for p in tmp_path.rglob("*")}
 
 
-
-
 @pytest.mark.parametrize("argv, said", [
     ("--env mars", "unknown environment 'mars'"), ("--level 4", "unknown maze level 4"), ("--mars 1", "unrecognized.*--mars"),
     ("--n 30", "n is 30 and N is 25"), ("--theta-sim 1.5", "theta_sim is 1.5.*from 0 to 1"), ("--theta-merge -1", "theta_merge"),
-    ("--M 0", "M is 0.*at least 1"), ("--additional-steps 25", "additional_steps is 25.*at least 26"), ("--L x", "--L: invalid"),
+    ("--M 0", "M is 0.*1 to 1,000,000"), ("--additional-steps 25", "additional_steps is 25.*least 26"), ("--L x", "--L: invalid"),
     ("--trajectory-steps 25", "at least 26"), ("--beta nan", "beta is nan"), ("--r-batch 1", "r_batch"), ("--M 2.5", "--M: inv"),
     ("--steps 5", "pretrain_steps is 8000"), ("--encoder big", "choose resnet18 or small"), ("--config big", "invalid choice"),
     ("--device cuda:99", "device cuda:99 cannot be used"), ("--device mars", "device mars"),
-    ("--threads 0", "threads is 0"),
-    ("--workers 0", "workers is 0"),
+    ("--threads 0", "threads is 0"), ("--threads 100000000000", "threads is"), ("--workers 0", "workers is 0"),
+    ("--device hpu", "device hpu"), (f"--M {10**30}", "M is"), ("--r-learning-rate 1e99", "r_learning_rate is"),
+    ("--resume=", "--resume is empty"), ("--verify=", "--verify is empty"), ("--env=", "--env is empty"),
+    ("--seeds 3", "with --experiment"), ("--experiment methods --seeds 0", "seeds is 0"),
+    ("--experiment methods --method random", "leave --method out"), ("--experiment ablation --rom x", "no option 'rom'"),
+    ("--verify run --export-demos run/config.json", "ends in .npz"),
     ("--frame-size 8", "frame_size is 8"), ("--rom x", "maze has no option 'rom'"),
     ("--env pop", "--rom"), ("--env pop --rom {tmp}/none.nes", "cannot read"), ("--env pop --rom {tmp}/bad.nes", "iNES"),
     ("--threads -1", "threads is -1"), ("--env montezuma --level 2", "no option"), ("--resume {tmp}/none", "cannot be read"),
@@ -1990,6 +1993,53 @@ def test_bad_input_is_one_line_and_nothing_is_made(argv, said, tmp_path, capsys)
     (tmp_path / "broken" / "config.json").write_text('{"config": ')
     argv = argv.format(tmp=tmp_path).split()
     check_refused(capsys, tmp_path, argv + ([] if "--resume" in argv else ["--out", str(tmp_path / "out")]), said)
+
+
+@pytest.mark.parametrize("old, new", [
+    ('"workers": 1', '"workers": "2"'), ('"workers": 1', '"workers": null'), ('"threads": 1', '"threads": 0'),
+    ("{", "[" * 10**5)])
+def test_a_config_that_was_damaged_is_one_line(finished, tmp_path, capsys, old, new):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    text = (folder / "config.json").read_text()
+    assert old in text
+    (folder / "config.json").write_text(text.replace(old, new, 1))
+    check_refused(capsys, tmp_path, ["--resume", str(folder)], "cannot be read")
+
+
+@pytest.mark.parametrize("cut", [lambda whole: whole[:50], lambda whole: None])
+def test_a_trace_that_was_cut_is_not_filled_up(finished, tmp_path, capsys, cut):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    left = cut((folder / "trace.jsonl").read_bytes())
+    (folder / "trace.jsonl").write_bytes(left) if left else (folder / "trace.jsonl").unlink()
+    check_refused(capsys, tmp_path, ["--resume", str(folder), "--trace"], "missing or cut short")
+
+
+def test_a_graph_that_breaks_its_invariants_is_a_damaged_checkpoint(finished, tmp_path, capsys):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    state["algorithm"]["graph"][1] += 1  # one state more than the clusters were visited by
+    torch.save(state, folder / "checkpoint.pt")
+    check_refused(capsys, tmp_path, ["--resume", str(folder)], "missing or damaged")
+
+
+def test_a_trace_begins_with_its_run(tmp_path):
+    for argv, events in (((), 0), (["--trace"], 1)):
+        folder = tmp_path / str(events)
+        folder.mkdir()
+        (folder / "trace.jsonl").write_text("of a run killed before its config.json\n")
+        assert main(["--method", "random", "--steps", "200", "--no-figures", "--out", str(folder), *argv]) == 0
+        lines = (folder / "trace.jsonl").read_text().splitlines() if (folder / "trace.jsonl").exists() else []
+        assert [json.loads(line)["event"] for line in lines] == ["iteration"] * events
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    def full(number):
+        raise OSError(28, "No space left on device")
+    rbexplore.write_atomically(tmp_path / "file", lambda f: f.write(b"old"))
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        rbexplore.write_atomically(tmp_path / "file", lambda f: torch.save(torch.zeros(9), f))
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
 
 
 def test_a_run_is_not_overwritten_nor_resumed_as_another(finished, tmp_path, capsys):
@@ -2120,7 +2170,7 @@ def test_what_serves_a_learned_R_alone_is_not_asked_of_cells():
 
 @pytest.mark.parametrize("error, said", [
     (rbexplore.BrokenProcessPool(), "a worker process died"),
-    (OSError(28, "No space left on device"), "a file cannot be written: No space")])
+    (OSError(28, "No space left on device"), "a file cannot be written: No space"), (MemoryError(), "out of memory")])
 def test_a_dead_worker_and_a_full_disk_are_one_line(tmp_path, monkeypatch, capsys, error, said):
     def fail(self):
         raise error
@@ -2357,6 +2407,38 @@ def test_the_contract_asks_for_close_for_pictures_and_for_the_frame_restored():
     for env, said in ((shut, r"lacks close\(\)"), (flat, r"\(H, W\)"), (same, "same frame")):
         with pytest.raises(InputError, match=said):
             envs.check_contract(env)
+
+
+@pytest.mark.parametrize("restore", [
+    lambda env, snapshot: env.frame(),  # goes nowhere
+    lambda env, snapshot: Grid.restore(env, snapshot)[::-1],  # draws something else
+    lambda env, snapshot: (Grid.restore(env, snapshot), setattr(env, "place", (3, 3)))[0],  # draws it and goes elsewhere
+    lambda env, snapshot: Grid.restore(env, bytes(max(x - 1, 0) for x in snapshot))])  # wrong but for the start
+def test_the_contract_finds_a_restore_that_does_not_restore(restore):
+    env = Grid()
+    envs.check_contract(env)
+    env.restore = functools.partial(restore, env)
+    with pytest.raises(InputError, match="same frame and future"):
+        envs.check_contract(env)
+
+
+@pytest.mark.parametrize("change", [lambda frame: frame / 255, lambda frame: frame.astype(int), lambda frame: frame[..., None]])
+def test_the_contract_asks_each_step_for_frames_as_the_space_says(change):
+    env = Grid()
+    step = env.step
+    env.step = lambda action: (change((result := step(action))[0]), *result[1:])
+    with pytest.raises(InputError, match="a frame is"):
+        envs.check_contract(env)
+
+
+@pytest.mark.parametrize("unit", [{1, 2}, {"x": 1}, ((1, 2), 3)])
+@pytest.mark.parametrize("method", ["rbexplore", "random"])
+def test_a_unit_that_cannot_be_counted_is_refused_at_the_start(unit, method):
+    class Odd(Grid):
+        def unit(self):
+            return unit
+    with pytest.raises(InputError, match=r"unit\(\) gives"):
+        make_method(method, Odd, QUICK)
 
 
 def test_distances_begin_at_the_snapshot():
@@ -3260,6 +3342,20 @@ def test_losses_of_ppo_and_of_icm_must_be_finite():
     icm.encoder[0].weight.data[:] = float("nan")
     with pytest.raises(FloatingPointError, match="ICM"):
         icm.update(*transitions(9))
+
+
+def test_an_experiment_tells_of_damaged_runs_and_needs_no_metrics(tmp_path, capsys):
+    options = TINY_OPTIONS | {"steps": 900, "pretrain-steps": 200, "beta": -0.00001}
+    line = ["--experiment", "ablation", "--seeds", "1", "--no-figures", "--out", str(tmp_path),
+            *(f"--{name}={value}" for name, value in options.items())]
+    assert main(line) == 0
+    (tmp_path / "no-merge-0" / "metrics.csv").unlink()
+    assert main(line) == 0
+    capsys.readouterr()
+    whole = (tmp_path / "rbexplore-0" / "checkpoint.pt").read_bytes()
+    (tmp_path / "rbexplore-0" / "checkpoint.pt").write_bytes(whole[:-9000])
+    assert main(line) == 2
+    assert re.fullmatch("rbexplore: .*rbexplore-0/checkpoint.pt cannot be loaded .*\n", capsys.readouterr().err)
 
 
 def test_an_interrupted_experiment_goes_on_also_with_other_versions(tmp_path, monkeypatch, capsys):
