@@ -199,8 +199,7 @@ class RbExplore:
     def restart(self) -> None:
         """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
         self.phase, self.novel, self.graph = "explore", [], Graph(self.s_init, self.snap_init, self.config)
-        if self.unit_init is not None:
-            self.discovered[self.unit_init] = self.steps
+        self.discovered |= {} if self.unit_init is None else {self.unit_init: self.steps}
         self.tell("restart")
 
     def theta_sim(self) -> float:
@@ -223,6 +222,7 @@ class RbExplore:
         trajectories = self.collect("explore", [self.graph.clusters[v].snapshot for v in chosen], self.config.trajectory_steps)
         for tau, v in zip(trajectories, chosen, strict=False):  # fewer, where the budget of steps ended
             tau.start = v
+            check_rollback(tau, self.graph.clusters[v])
         return trajectories
 
     def collect(self, purpose: str, snapshots: list[bytes], steps: int) -> list["Trajectory"]:
@@ -735,6 +735,13 @@ def walks(a: RbExplore, jobs: list[tuple]):
     if a.executor:
         return a.executor.map(walk_remotely, [(a.owner, a.env_fn)] * len(jobs), jobs)
     return (walk(a.env, *job) for job in jobs)
+
+
+def check_rollback(tau: Trajectory, start: Cluster) -> None:
+    """Raise InputError for an environment that did not come back to the centre, or whose frames are of another kind."""
+    if tau.frames.dtype != np.uint8 or not np.array_equal(tau.frames[0], start.frame):
+        raise InputError("restore() did not give the frame of its snapshot again, or step() gives frames that are not uint8: see "
+                         "PersistentEnv in envs.py")
 
 
 _worker = threading.local()  # an environment for each process, or thread, of an executor
