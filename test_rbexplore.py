@@ -3921,8 +3921,8 @@ MUTANTS = [  # statement, what is wrong, the source, its wrong version, the test
      '        since = bytes([action])\n',
      'test_R24_blank'),
     ('S6.1-15', 'the restart does not reset G',
-     '[], Graph(self.s_init, self.snap_init, self.config)\n        if self.unit',
-     '[], self.graph\n        if self.unit',
+     '[], Graph(self.s_init, self.snap_init, self.config)\n        self.discovered',
+     '[], self.graph\n        self.discovered',
      'test_S6_1_14_'),
     ('S6.1-15', 'the restart makes R anew',
      '        self.tell("restart")\n',
@@ -4191,4 +4191,4 @@ def test_mutant_is_killed(mutant, tmp_path):
         (tmp_path / name).write_text((HERE / name).read_text())
     done = subprocess.run([sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", "-k", test, "test_rbexplore.py"],
                           cwd=tmp_path, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 1 and " failed" in done.stdout, done.stdout
+    assert done.returncode == 1, done.stdout  # a test or its set-up failed; 2 would be: no test could be collected
