@@ -1307,10 +1307,10 @@ class Run:
 
     def create(self) -> None:
         """Begin in a folder that holds no run yet."""
-        if (self.folder / "config.json").exists():
+        trace = self.folder / "trace.jsonl"  # ours is empty until there is a config.json
+        if (self.folder / "config.json").exists() or trace.exists() and trace.stat().st_size:
             raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
         self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / "trace.jsonl").unlink(missing_ok=True)  # of a run killed before it had begun
         self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
         write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
 

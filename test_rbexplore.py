@@ -2021,14 +2021,15 @@ def test_a_graph_that_breaks_its_invariants_is_a_damaged_checkpoint(finished, tm
     check_refused(capsys, tmp_path, ["--resume", str(folder)], "missing or damaged")
 
 
-def test_a_trace_begins_with_its_run(tmp_path):
-    for argv, events in (((), 0), (["--trace"], 1)):
-        folder = tmp_path / str(events)
-        folder.mkdir()
-        (folder / "trace.jsonl").write_text("of a run killed before its config.json\n")
-        assert main(["--method", "random", "--steps", "200", "--no-figures", "--out", str(folder), *argv]) == 0
-        lines = (folder / "trace.jsonl").read_text().splitlines() if (folder / "trace.jsonl").exists() else []
-        assert [json.loads(line)["event"] for line in lines] == ["iteration"] * events
+@pytest.mark.parametrize("argv", [[], ["--trace"]])
+def test_a_trace_of_something_else_is_kept(tmp_path, capsys, argv):
+    line = ["--method", "random", "--steps", "200", "--no-figures", "--out", str(tmp_path), *argv]
+    (tmp_path / "trace.jsonl").write_text("somebody's own\n")
+    check_refused(capsys, tmp_path, line, "holds a run already")
+    (tmp_path / "trace.jsonl").write_text("")  # of a run killed before its config.json
+    assert main(line) == 0
+    lines = (tmp_path / "trace.jsonl").read_text().splitlines()
+    assert [json.loads(line)["event"] for line in lines] == ["iteration"] * len(argv)
 
 
 def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
