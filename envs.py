@@ -1,12 +1,15 @@
-"""Environments that can be rolled back (paper 3.2 and 5): the contract, a small maze, the emulators, the factory.
+"""Environments that can be rolled back (paper 3.2 and 5).
 
-Beyond Gymnasium's interface they save and restore their complete state. Coverage units are for metrics and figures only."""
+The contract of a persistent environment · the maze · the emulators · coverage units ·
+the factory by name. Coverage units are for metrics and figures; the algorithm never sees them.
+"""
 
 import gzip
 import inspect
 import tempfile
 import zlib
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,60 +18,238 @@ import numpy as np
 class InputError(ValueError):
     """Something that the user can put right; its message is the one line that is shown."""
 
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.split()))  # what it quotes may have several lines
 
-# ---- The contract of a persistent environment (paper 3.2) --------------------------------------------------------
+
+# ---- The contract of a persistent environment (paper 3.2; S3.2-01, S3.2-02) ----------------------
 
 
 class PersistentEnv(gymnasium.Env):
-    """A Gymnasium environment whose states can be saved and returned to: a persistent MDP (paper 3.2).
+    """A Gymnasium environment whose states can be saved and returned to: a persistent MDP (3.2).
 
-    observation_space is a Box of uint8 (H, W), grayscale; action_space is Discrete. Rewards are ignored. Where `step` reports
-    info["blank"] = True, the frame is a transition screen and no state (R24): it is stepped and counted, but never a centre.
-    A level_map(), if any, is for figures: the level (H, W, 3) uint8 and each unit's box (left, top, width, height) in pixels."""
+    observation_space: a Box of uint8, (H, W) or (H, W, C) with C <= 4: channels come last.
+    action_space: Discrete, at most 256 actions. Rewards are ignored.
+    reset(seed=...) gives (frame, info), and the same seed the same state every time.
 
-    full_coverage: int | None = None  # number of units of full coverage (paper 5), None where it is not known
-    unit_name = "units"  # what a unit is, printed beside every coverage (reading R26)
+    info["blank"] = True in a step's info says that the frame is a transition screen and no state
+    (R24): the step counts, but the frame is never a centre.
+
+    A level_map(), if there is one, is for figures: the picture of the level (H, W, 3) uint8, and
+    the box (left, top, width, height) of each unit in it, in pixels.
+
+    A time limit belongs outside the environment, or at least outside the snapshot's way: a limit
+    whose counter is in the snapshot is restored with it, and strangles exploration, which goes on
+    from ever later states. The configuration sets the length of a trajectory. A counter outside
+    the snapshot breaks the replay, so there should be none at all.
+
+    Snapshots are held by the thousand: an iteration holds M x trajectory_steps of them, which at
+    1 MB each and with the paper's numbers makes 45 GB. Keep them small.
+    """
+
+    full_coverage: int | None = None  # number of units of full coverage (5), None if unknown
+    unit_name = "units"  # what a unit is, printed beside every coverage (R26)
 
     def snapshot(self) -> bytes:
-        """The complete state (position, clocks, generators, everything hidden) in as few bytes as possible."""
+        """The complete state: position, clocks, generators, everything hidden."""
         raise NotImplementedError
 
     def restore(self, snapshot: bytes) -> np.ndarray:
-        """Return to the state of `snapshot`; gives its observation, (H, W) uint8, and costs no step. The same actions then give
-        the same frames and outcomes as the first time, in any process. InputError: malformed, or of another environment."""
+        """Return to the state of `snapshot`, at no step; gives its observation, and that alone.
+
+        The same actions then give the same frames and outcomes as the first time, in any process.
+        InputError: malformed, or of another environment.
+        """
         raise NotImplementedError
 
-    def unit(self) -> tuple[int, ...] | None:
-        """The coverage unit in which the agent stands (5), None where it is in none or dead. The algorithm never sees it."""
+    def unit(self) -> tuple | int | str | None:
+        """The coverage unit in which the agent stands (5), see unit_key; None: in none, or dead."""
         raise NotImplementedError
 
 
-def check_contract(env) -> None:
-    """Raise InputError, saying what is wrong, unless `env` is a persistent environment as PersistentEnv describes it."""
-    names = ["reset", "step", "snapshot", "restore", "unit", "close"]
-    if missing := [name for name in names if not callable(getattr(env, name, None))]:
-        raise InputError(f"the environment lacks {', '.join(missing)}(), see envs.py; of a wrapped one give env.unwrapped")
-    actions, frames = getattr(env, "action_space", None), getattr(env, "observation_space", None)
+METHODS = ("reset", "step", "snapshot", "restore", "unit", "close")
+CONTRACT_STEPS = 100  # of the walk that check_contract plays
+
+
+def check_contract(env, seed: int = 0) -> None:
+    """Raise InputError, one line, unless `env` is a persistent environment (PersistentEnv).
+
+    It plays: a random walk with snapshots on the way, then each part of the walk once more from
+    its snapshot, the last part first. What is seen must be the same. Afterwards `env` is at s_init.
+    What does not show within such a walk, or only in another process, it cannot find.
+    """
+    check_methods(env)
+    check_spaces(env)
+    player = ContractPlayer(env, seed)
+    parts = player.walk()
+    # In another order than the first time: what the snapshots lack is then out of place.
+    for part in reversed(parts):
+        player.replay(part)
+    player.compare("reset() with the same seed", parts[0].start, player.reset())
+
+
+def check_methods(env) -> None:
+    """Raise InputError unless `env` is an instance with the methods of the contract."""
+    maker = callable(env) and not hasattr(env, "step")
+    if maker or isinstance(env, type):
+        raise InputError(
+            f"{env!r:.80} is no environment: give a function that makes the environment, so "
+            "that calling it once gives an instance"
+        )
+    missing = [name for name in METHODS if not callable(getattr(env, name, None))]
+    if missing:
+        wrapped = isinstance(env, gymnasium.Wrapper)
+        hint = "; give env.unwrapped, or add them to the wrapper" if wrapped else ""
+        raise InputError(
+            f"the environment lacks {', '.join(missing)}(), see PersistentEnv in envs.py{hint}"
+        )
+
+
+def check_spaces(env) -> None:
+    """Raise InputError unless the spaces are as PersistentEnv says."""
+    actions = getattr(env, "action_space", None)
     if not isinstance(actions, gymnasium.spaces.Discrete) or actions.n > 256:
-        raise InputError(f"the action space is {actions}: it must be Discrete with at most 256 actions")
-    if not isinstance(frames, gymnasium.spaces.Box) or frames.dtype != np.uint8 or len(frames.shape) not in (2, 3):
-        raise InputError(f"the observation space is {frames}: it must be a Box of uint8, (H, W) or (H, W, C)")
-    frame = np.array(env.reset()[0])
-    if frame.shape != frames.shape or frame.dtype != np.uint8:
-        raise InputError(f"reset() gives a frame {frame.shape} of {frame.dtype}: it must be as the observation space says")
-    snapshot = env.snapshot()
-    if not isinstance(snapshot, bytes) or not np.array_equal(env.restore(snapshot), frame):
-        raise InputError("snapshot() must give bytes, and restore() of them the same frame again: see PersistentEnv in envs.py")
+        raise InputError(
+            f"the action space is {actions}: it must be Discrete with at most 256 actions"
+        )
+    frames = getattr(env, "observation_space", None)
+    images = isinstance(frames, gymnasium.spaces.Box) and frames.dtype == np.uint8
+    if not images or len(frames.shape) not in (2, 3):
+        raise InputError(
+            f"the observation space is {frames}: it must be a Box of uint8, (H, W) or (H, W, C)"
+        )
+    if len(frames.shape) == 3 and frames.shape[2] > 4:
+        raise InputError(f"frames are {frames.shape}: channels come last, (H, W, C), at most 4")
 
 
-# ---- The maze: a side-view level in the spirit of the Prince of Persia (paper 5) ---------------------------------
+class Part(NamedTuple):
+    """A part of the contract's walk: to the next snapshot, or to the end of an episode."""
 
-NOOP, LEFT, RIGHT, UP, DOWN, A, B = range(7)  # the seven actions of the Prince of Persia environment, in its order
-COLUMNS, ROWS = 10, 3  # tiles of a room, which is one screen
+    steps: int  # taken before it
+    snapshot: bytes
+    start: dict  # what is seen there
+    moves: list[tuple[int, dict]]  # each action, and what is seen after it
+
+
+class ContractPlayer:
+    """Plays an environment for check_contract. What breaks the contract is an InputError."""
+
+    def __init__(self, env, seed: int):
+        self.env = env
+        self.seed = seed
+        self.steps = 0  # of the walk, up to the moment that is played
+
+    def walk(self) -> list[Part]:
+        """Play the random walk, going on from reset where an episode ends."""
+        space = self.env.action_space
+        generator = np.random.default_rng(0)
+        parts = []
+        seen = self.reset()
+        while self.steps < CONTRACT_STEPS:
+            part = Part(self.steps, self.snapshot(), seen, [])
+            parts.append(part)
+            # Uneven lengths: a hidden clock must not be right again by its period.
+            for _ in range(generator.integers(5, 15)):
+                action = int(space.start + generator.integers(space.n))
+                seen = self.step(action)
+                part.moves.append((action, seen))
+                if seen["terminated"] or seen["truncated"]:
+                    seen = self.reset()
+                    break
+        return parts
+
+    def replay(self, part):
+        """Restore the snapshot of a part and play its actions again."""
+        self.steps = part.steps
+        frame = self.call("restore", part.snapshot)
+        self.compare("restore()", part.start, self.see("restore", frame))
+        for action, seen in part.moves:
+            self.compare("the same action after a restore", seen, self.step(action))
+
+    def compare(self, what, first, second):
+        for name in first:
+            # A restore or a reset tells of the frame and the unit alone.
+            if name in second and first[name] != second[name]:
+                self.refuse(f"{what} gives another {name} than the first time")
+
+    def reset(self):
+        result = self.call("reset", seed=self.seed)
+        pair = isinstance(result, tuple) and len(result) == 2
+        if not pair or not isinstance(result[1], dict):
+            self.refuse("reset() must give a frame and a dict")
+        return self.see("reset", result[0])
+
+    def step(self, action):
+        self.steps += 1
+        result = self.call("step", action)
+        if not isinstance(result, tuple) or len(result) != 5:
+            self.refuse("step() must give five values: frame, reward, terminated, truncated, info")
+        frame, _, terminated, truncated, info = result
+        if not isinstance(info, dict):
+            self.refuse(f"step() gives {info!r:.60} for info: give a dict")
+        seen = self.see("step", frame)
+        blank = info.get("blank", False)
+        flags = {"terminated": terminated, "truncated": truncated, "blank": blank}
+        for name, flag in flags.items():
+            if not isinstance(flag, bool | np.bool_):
+                self.refuse(f"step() gives {flag!r:.60} for {name}: give a bool")
+            seen[name] = bool(flag)
+        return seen
+
+    def snapshot(self):
+        snapshot = self.call("snapshot")
+        if not isinstance(snapshot, bytes):
+            self.refuse(f"snapshot() gives {type(snapshot).__name__}: give bytes")
+        return snapshot
+
+    def see(self, name, frame):
+        """The frame that a method gave, as bytes, and the unit."""
+        shape = self.env.observation_space.shape
+        if not isinstance(frame, np.ndarray):
+            self.refuse(f"{name}() gives a {type(frame).__name__} for the frame: give an array")
+        if frame.shape != shape or frame.dtype != np.uint8:
+            self.refuse(
+                f"{name}() gives a frame {frame.shape} of {frame.dtype}: "
+                f"the observation space says {shape} of uint8"
+            )
+        unit = self.call("unit")
+        try:
+            key = unit_key(unit)
+        except InputError as error:
+            self.refuse(str(error))
+        # A copy of the frame: the environment may use its array again.
+        return {"frame": frame.tobytes(), "unit": key}
+
+    def call(self, name, *arguments, **named):
+        """Call a method of the environment; an error in it is told in one line."""
+        try:
+            return getattr(self.env, name)(*arguments, **named)
+        except Exception as error:
+            self.refuse(f"{name}() fails with {type(error).__name__}: {error}")
+
+    def refuse(self, problem):
+        raise InputError(f"the environment, after step {self.steps}: {problem}") from None
+
+
+# ---- The maze: a side-view level in the spirit of the Prince of Persia (paper 5) -----------------
+
+# The seven actions of the Prince of Persia environment, in its order (S5-02).
+NOOP = 0
+LEFT = 1
+RIGHT = 2
+UP = 3
+DOWN = 4
+A = 5
+B = 6
+
+COLUMNS = 10  # tiles of a room, which is one screen
+ROWS = 3
 
 # A level is drawn in rooms of 10 x 3 tiles, apart by spaces.
-#   #  wall      _  floor       @  floor where the agent starts     .  open: no floor, one falls through
-#   ^  spikes    a  pressure plate, latched, opens every gate A     A  gate, closed until its plate is pressed
+#   #  wall      _  floor       @  floor where the agent starts
+#   ^  spikes    .  open: no floor, one falls through
+#   a  pressure plate, latched, opens every gate A
+#   A  gate, closed until its plate is pressed
 LEVELS = {
     2: """
     ##.____^__ _______.__ _____.____ ___.____##
@@ -96,60 +277,111 @@ LEVELS = {
     #___G____# #____^__g# #_^_____h# #_^__H__^#
     """,
 }
-LEVELS[1] = "\n".join(line[:36] for line in LEVELS[2].splitlines())  # its first three columns of rooms
+# Level 1 is the first three columns of rooms of level 2.
+LEVELS[1] = "\n".join(line[:36] for line in LEVELS[2].splitlines())
 
-# The agent, facing right, alive and dead; h head, b body: drawn at 6 x 12 to a tile, sampled to the tile's real size.
-SPRITE = ("...... ...... ...... ...... ..hhhh ..hhhh ..bb.. .bbbbb .bbb.b ..bb.. .bbbb. bb..bb",
-          "...... ...... ...... ...... ...... ...... ...... ...... ...... ...... bbbbbh bbbbhh")
+# The agent, facing right; h head, b body. Drawn at 6 x 12, sampled to the tile's real size.
+ALIVE = """
+......
+......
+......
+......
+..hhhh
+..hhhh
+..bb..
+.bbbbb
+.bbb.b
+..bb..
+.bbbb.
+bb..bb
+"""
+DEAD = """
+......
+......
+......
+......
+......
+......
+......
+......
+......
+......
+bbbbbh
+bbbbhh
+"""
 COLOURS = {"h": (255, 214, 170), "b": (255, 255, 255)}
+FLOOR = (186, 160, 120)
+STONE = (112, 98, 86)
+STEEL = (196, 206, 214)
+PLATE = (240, 196, 60)
+SUNK = (84, 60, 40)
+TINTS = ((0.8, 0.9, 1.3), (1.2, 0.9, 0.8), (0.8, 1.1, 0.8))  # of the rooms' walls
 LUMINANCE = np.array([77, 150, 29], np.uint32)  # of red, green and blue, in 1/256
-FLOOR, STONE, STEEL, PLATE, SUNK = (186, 160, 120), (112, 98, 86), (196, 206, 214), (240, 196, 60), (84, 60, 40)
+
+FRAMES_KEPT = 4096
+
+
+class State(NamedTuple):
+    """The full state of a maze."""
+
+    x: int  # tiles from the left of the level
+    y: int  # tiles from its top
+    facing: int  # 1 right, 0 left
+    plates: int  # the plates pressed, as bits
+    dead: int
 
 
 class Maze(PersistentEnv):
     """A deterministic level of several rooms, of which the agent sees one; the reward is always 0.
-    LEFT and RIGHT turn the agent or, where it faces that way, run one tile. A jumps two tiles ahead, over whatever is in the tile
-    between. B steps one tile ahead, onto spikes without harm and never over an edge. UP climbs, from under an opening, to the
-    floor beside it that the agent faces. DOWN hangs from the edge ahead and lets go, which takes a row off the fall. A fall of
-    two rows or more kills, and so do spikes met in any way but by B.
-    unit() is (room, column, row). A snapshot is canonical: equal states have equal bytes. Raises InputError for an unknown
-    level, a frame_size that is no int or is below 32, an unknown render_mode."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    LEFT and RIGHT turn the agent or, where it faces that way, run one tile.
+    A jumps two tiles ahead, over whatever is in the tile between.
+    B steps one tile ahead, onto spikes without harm and never over an edge.
+    UP climbs, from under an opening, to the floor beside it that the agent faces.
+    DOWN hangs from the edge ahead and lets go, which takes a row off the fall.
+    A fall of two rows or more kills, and so do spikes met in any way but by B.
+
+    unit() is (room, column, row). A snapshot is canonical: equal states have equal bytes.
+    InputError: an unknown level, a frame_size that is no int or is below 32.
+    """
+
     unit_name = "tiles"
 
-    def __init__(self, level: int = 1, frame_size: int = 32, render_mode: str | None = None):
+    def __init__(self, level: int = 1, frame_size: int = 32):
         if not isinstance(level, int) or level not in LEVELS:
-            raise InputError(f"unknown maze level {level!r}: there are {', '.join(map(str, sorted(LEVELS)))}")
+            known = ", ".join(str(number) for number in sorted(LEVELS))
+            raise InputError(f"unknown maze level {level!r}: there are {known}")
         if not isinstance(frame_size, int) or frame_size < 32:
-            raise InputError(f"frame_size must be a whole number of pixels, 32 or more, and not {frame_size!r}")
-        if render_mode not in (None, "rgb_array"):
-            raise InputError(f"unknown render_mode {render_mode!r}: the maze has rgb_array")
-        self.level, self.frame_size, self.render_mode = level, frame_size, render_mode
-        self.tiles = [line.replace(" ", "") for line in LEVELS[level].splitlines() if line.strip()]
-        self.across, self.down = len(self.tiles[0]) // COLUMNS, len(self.tiles) // ROWS  # rooms
-        self.letters = sorted({tile for line in self.tiles for tile in line if tile.islower()})
-        (start,) = [(x, y) for y, line in enumerate(self.tiles) for x, tile in enumerate(line) if tile == "@"]
-        self.start = self.state = (*start, 1, 0, 0)  # x, y, facing right, plates pressed as bits, dead
+            raise InputError(f"frame_size must be an int, 32 pixels or more, not {frame_size!r}")
+        self.level = level
+        self.frame_size = frame_size
+        drawing = LEVELS[level].replace(" ", "")
+        self.tiles = drawing.split()
+        self.across = len(self.tiles[0]) // COLUMNS  # rooms
+        self.down = len(self.tiles) // ROWS
+        self.letters = sorted({tile for tile in drawing if tile.islower()})
+        y = next(y for y, line in enumerate(self.tiles) if "@" in line)
+        x = self.tiles[y].index("@")
+        self.start = State(x, y, facing=1, plates=0, dead=0)
+        self.state = self.start
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._seen: dict[tuple, np.ndarray] = {}  # frames of the states met lately
+        self._seen: dict[State, np.ndarray] = {}  # frames of the states met lately
         self.full_coverage = len(self.reachable())
 
     def reset(self, *, seed=None, options=None):
-        """Back to the start of the level; gives the observation, (frame_size, frame_size) uint8, and {}."""
+        """Back to the start; gives the frame, (frame_size, frame_size) uint8, and {}."""
         super().reset(seed=seed)
         self.state = self.start
         return self._frame(), {}
 
     def step(self, action: int):
-        """One action, 0 to 6. Raises InputError for any other, and where the agent is already dead."""
-        if action not in range(7):
-            raise InputError(f"the maze has actions 0 to 6, and not {action!r}")
-        if self.state[4]:
+        """One action. InputError: it is not one of 0 to 6, or the agent is already dead."""
+        check_action(action, 7)
+        if self.state.dead:
             raise InputError("the agent is dead: reset or restore the maze before the next step")
         self.state = self._next(self.state, action)
-        return self._frame(), 0.0, bool(self.state[4]), False, {}
+        return self._frame(), 0.0, bool(self.state.dead), False, {}
 
     def snapshot(self) -> bytes:
         """Six bytes: level, x, y, facing, plates, dead."""
@@ -162,158 +394,242 @@ class Maze(PersistentEnv):
 
     def unit(self) -> tuple[int, int, int] | None:
         """(room, column, row) of the living agent, None of a dead one."""
-        x, y, *_, dead = self.state
-        return None if dead else self._place(x, y)
-
-    def render(self) -> np.ndarray | None:
-        """The room in which the agent is, (360, 360, 3) uint8; None without a render_mode."""
-        return None if self.render_mode is None else self._picture(36, 120)
+        if self.state.dead:
+            return None
+        return self._place(self.state.x, self.state.y)
 
     def reachable(self) -> set[tuple[int, int, int]]:
-        """Every unit in which the agent can stand alive, by breadth-first search over the full states."""
-        return {self._place(x, y) for x, y, *_, dead in self._search(self.start) if not dead}
+        """Every unit in which the agent can stand alive, by search over the full states (S5-03)."""
+        states = self._search(self.start)
+        return {self._place(state.x, state.y) for state in states if not state.dead}
 
     def distances(self, snapshot: bytes) -> dict[bytes, int]:
-        """Steps from the state of `snapshot` to every full state that follows from it, dead ones too, by snapshot."""
-        return {bytes((self.level, *state)): steps for state, steps in self._search(self._read(snapshot)).items()}
+        """Steps from the state of `snapshot` to every state that follows from it, by snapshot."""
+        found = self._search(self._read(snapshot))
+        return {bytes((self.level, *state)): steps for state, steps in found.items()}
 
-    def level_map(self) -> tuple[np.ndarray, dict[tuple[int, int, int], tuple[int, int, int, int]]]:
-        """The whole level with tiles of 8 x 24 pixels, nothing pressed yet; a box for each reachable unit."""
-        w, h, across = 8, 24, self.across
-        rows = [np.hstack([self._paint_room(k * across + i, 0, w, h) for i in range(across)]) for k in range(self.down)]
-        return np.vstack(rows), {(room, x, y): ((room % across * COLUMNS + x) * w, (room // across * ROWS + y) * h, w, h)
-                                 for room, x, y in self.reachable()}
+    def level_map(self) -> tuple[np.ndarray, dict[tuple, tuple[int, int, int, int]]]:
+        """The level in tiles of 8 x 24 pixels, nothing pressed, and each reachable unit's box."""
+        w = 8
+        h = 24
+        lines = []
+        for k in range(self.down):
+            rooms = range(k * self.across, (k + 1) * self.across)
+            lines.append(np.hstack([self._paint_room(room, 0, w, h) for room in rooms]))
+        boxes = {}
+        for room, column, row in self.reachable():
+            x = room % self.across * COLUMNS + column
+            y = room // self.across * ROWS + row
+            boxes[room, column, row] = (x * w, y * h, w, h)
+        return np.vstack(lines), boxes
 
-    def _tile(self, x: int, y: int, plates: int) -> str:
-        """The tile as it acts now: beyond the level and at a closed gate there is wall, at an open one floor."""
-        tile = self.tiles[y][x] if 0 <= y < len(self.tiles) and 0 <= x < len(self.tiles[0]) else "#"
-        opened = tile.isupper() and plates >> self.letters.index(tile.lower()) & 1
-        return "_" if opened else "#" if tile.isupper() else tile
+    def _place(self, x, y):
+        """(room, column, row) of a tile; rooms are counted along the lines of the level."""
+        room = y // ROWS * self.across + x // COLUMNS
+        return room, x % COLUMNS, y % ROWS
 
-    def _next(self, state: tuple, action: int) -> tuple:
+    def _pressed(self, letter, plates):
+        """Is the plate of that letter, or of that gate's letter, pressed?"""
+        return bool(plates >> self.letters.index(letter.lower()) & 1)
+
+    def _tile(self, x, y, plates):
+        """The tile as it acts now: a closed gate is wall, an open one floor."""
+        if not (0 <= y < len(self.tiles) and 0 <= x < len(self.tiles[0])):
+            return "#"  # beyond the level
+        tile = self.tiles[y][x]
+        if tile.isupper():
+            return "_" if self._pressed(tile, plates) else "#"
+        return tile
+
+    def _next(self, state: State, action: int) -> State:
         """The state after one action."""
         x, y, facing, plates, _ = state
-        ahead, hang = 1 if facing else -1, 0
-        if action in (LEFT, RIGHT) and facing != (action == RIGHT):
-            facing = 1 - facing
-        elif action in (LEFT, RIGHT) and self._tile(x + ahead, y, plates) != "#":
-            x += ahead
+        ahead = 1 if facing else -1
+        tile_ahead = self._tile(x + ahead, y, plates)
+        hanging = 0  # rows by which the fall is shorter
+        if action in (LEFT, RIGHT):
+            wanted = int(action == RIGHT)
+            if facing != wanted:
+                facing = wanted
+            elif tile_ahead != "#":
+                x += ahead
         elif action == UP:
-            if self._tile(x, y - 1, plates) == "." and self._tile(x + ahead, y - 1, plates) not in "#.":
-                x, y = x + ahead, y - 1
-        elif action == DOWN and self._tile(x + ahead, y, plates) == ".":
-            x, hang = x + ahead, 1
+            opening = self._tile(x, y - 1, plates) == "."
+            if opening and self._tile(x + ahead, y - 1, plates) not in "#.":
+                x += ahead
+                y -= 1
+        elif action == DOWN:
+            if tile_ahead == ".":
+                x += ahead
+                hanging = 1
         elif action == A:
             for _ in range(2):
-                x += ahead if self._tile(x + ahead, y, plates) != "#" else 0
-        elif action == B and self._tile(x + ahead, y, plates) not in "#.":
+                if self._tile(x + ahead, y, plates) != "#":
+                    x += ahead
+        elif action == B and tile_ahead not in "#.":
             x += ahead
         edge = y
-        while (tile := self._tile(x, y, plates)) == ".":
+        while self._tile(x, y, plates) == ".":
             y += 1
-        arrived = (x, y) != state[:2]
-        dead = y - edge - hang >= 2 or (arrived and tile == "^" and action != B)
+        tile = self._tile(x, y, plates)
+        crushed = y - edge - hanging >= 2
+        arrived = (x, y) != (state.x, state.y)
+        impaled = arrived and tile == "^" and action != B
         if tile.islower():
             plates |= 1 << self.letters.index(tile)
-        return x, y, facing, plates, int(dead)
+        return State(x, y, facing, plates, int(crushed or impaled))
 
-    def _search(self, start: tuple) -> dict[tuple, int]:
+    def _search(self, start: State) -> dict[State, int]:
         """Breadth-first: each state that follows from `start`, with its distance in steps."""
-        steps, queue = {start: 0}, [start]
+        steps = {start: 0}
+        queue = [start]
         for state in queue:  # which grows meanwhile
-            for action in range(0 if state[4] else 7):
+            if state.dead:
+                continue
+            for action in range(7):
                 after = self._next(state, action)
                 if after not in steps:
                     steps[after] = steps[state] + 1
                     queue.append(after)
         return steps
 
-    def _read(self, snapshot: bytes) -> tuple:
+    def _read(self, snapshot: bytes) -> State:
+        """The state of a snapshot. InputError: it is of another level, or of no possible state."""
         if isinstance(snapshot, bytes) and len(snapshot) == 6 and snapshot[0] == self.level:
-            x, y, facing, plates, dead = state = tuple(snapshot[1:])
-            if facing < 2 and dead < 2 and not plates >> len(self.letters) and self._tile(x, y, plates) not in "#.":
+            state = State(*snapshot[1:])
+            flags = state.facing < 2 and state.dead < 2
+            known = state.plates < 2 ** len(self.letters)
+            if flags and known and self._tile(state.x, state.y, state.plates) not in "#.":
                 return state
         raise InputError(f"no snapshot of maze level {self.level}: {snapshot!r:.60}")
 
-    def _place(self, x: int, y: int) -> tuple[int, int, int]:
-        return y // ROWS * self.across + x // COLUMNS, x % COLUMNS, y % ROWS  # room, column, row
-
-    def _frame(self) -> np.ndarray:
-        """The observation: luminance, in whole numbers so that every machine agrees, centred on black."""
+    def _frame(self):
+        """The observation of the present state, a copy: the caller may write into it."""
         if self.state not in self._seen:
-            self._seen = self._seen if len(self._seen) < 4096 else {}
-            size, frame = self.frame_size, np.zeros((self.frame_size, self.frame_size), np.uint8)
-            picture = self._picture(size // COLUMNS, size // ROWS)
-            top, left = ((size - side) // 2 for side in picture.shape[:2])
-            frame[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.astype(np.uint32) @ LUMINANCE >> 8
-            self._seen[self.state] = frame
+            if len(self._seen) >= FRAMES_KEPT:
+                self._seen.clear()
+            self._seen[self.state] = self._draw()
         return self._seen[self.state].copy()
 
-    def _picture(self, w: int, h: int) -> np.ndarray:
-        """The room with the agent, (3 h, 10 w, 3) uint8."""
-        x, y, facing, plates, dead = self.state
-        room, column, row = self._place(x, y)
-        picture = self._paint_room(room, plates, w, h)
-        paint_agent(picture[row * h :, column * w :][:h, :w], facing, dead)
+    def _draw(self):
+        """The observation: the room's luminance, centred on black.
+
+        In whole numbers, so that every machine agrees."""
+        size = self.frame_size
+        picture = self._picture(size // COLUMNS, size // ROWS)
+        height, width, _ = picture.shape
+        top = (size - height) // 2
+        left = (size - width) // 2
+        frame = np.zeros((size, size), np.uint8)
+        frame[top : top + height, left : left + width] = picture.astype(np.uint32) @ LUMINANCE >> 8
+        return frame
+
+    def _picture(self, w, h):
+        """The room with the agent, in tiles of w x h pixels: (3 h, 10 w, 3) uint8."""
+        state = self.state
+        room, column, row = self._place(state.x, state.y)
+        picture = self._paint_room(room, state.plates, w, h)
+        box = picture[row * h : (row + 1) * h, column * w : (column + 1) * w]
+        paint_agent(box, state.facing, state.dead)
         return picture
 
-    def _paint_room(self, room: int, plates: int, w: int, h: int) -> np.ndarray:
+    def _paint_room(self, room, plates, w, h):
         """The room without the agent, (3 h, 10 w, 3) uint8; plates and gates show their state."""
-        pixel, thick = max(1, w // 3), max(1, h // 8)
-        down, across = np.indices((ROWS * h, COLUMNS * w)) // pixel
-        pattern = (down * 0, down // 2 % 2, across // 2 % 2, (down // 2 + across // 2) % 2, (down + across) // 2 % 2)
-        shade = 18 + room * 5 % 7 * 8 + 16 * pattern[room % 5]
-        tint = ((0.8, 0.9, 1.3), (1.2, 0.9, 0.8), (0.8, 1.1, 0.8))[room % 3]
-        picture = (shade[..., None] * np.array(tint)).astype(np.uint8)
+        picture = paint_back_wall(room, w, h)
         for row, column in np.ndindex(ROWS, COLUMNS):
-            tile = self.tiles[room // self.across * ROWS + row][room % self.across * COLUMNS + column]
+            x = room % self.across * COLUMNS + column
+            y = room // self.across * ROWS + row
+            tile = self.tiles[y][x]
+            pressed = tile.isalpha() and self._pressed(tile, plates)
             box = picture[row * h : (row + 1) * h, column * w : (column + 1) * w]
-            pressed = tile.isalpha() and plates >> self.letters.index(tile.lower()) & 1
-            if tile == "#":
-                box[:] = STONE
-                box[::thick * 2] = np.array(STONE) * 3 // 4  # joints
-            elif tile != ".":
-                box[-thick:] = FLOOR
-            if tile == "^":
-                for i in range(w):  # two teeth
-                    box[h - thick - round(0.3 * h * (1 - abs((2 * i + 1) / w % 1 * 2 - 1))) : h - thick, i] = STEEL
-            elif tile.islower():
-                box[-thick if pressed else -2 * thick :] = SUNK if pressed else PLATE
-            elif tile.isupper():
-                box[: h // 5 if pressed else h - thick, np.arange(w) // pixel % 2 == 0] = STEEL  # bars
+            paint_tile(box, tile, pressed)
         return picture
+
+
+def paint_back_wall(room, w, h):
+    """The wall behind a room, (3 h, 10 w, 3) uint8: rooms differ in pattern, shade and tint."""
+    down, across = np.indices((ROWS * h, COLUMNS * w)) // max(1, w // 3)
+    patterns = (
+        np.zeros_like(down),
+        down // 2 % 2,
+        across // 2 % 2,
+        (down // 2 + across // 2) % 2,
+        (down + across) // 2 % 2,
+    )
+    shade = 18 + room * 5 % 7 * 8 + 16 * patterns[room % 5]
+    tint = np.array(TINTS[room % 3])
+    return (shade[..., None] * tint).astype(np.uint8)
+
+
+def paint_tile(box: np.ndarray, tile: str, pressed: bool) -> None:
+    """Paint one tile, (h, w, 3) uint8, in place; `pressed`: it is a plate that is, or its gate."""
+    h, w, _ = box.shape
+    thick = max(1, h // 8)
+    if tile == "#":
+        box[:] = STONE
+        box[:: thick * 2] = np.array(STONE) * 3 // 4  # joints
+    elif tile != ".":
+        box[-thick:] = FLOOR
+    if tile == "^":
+        for i in range(w):
+            along = (2 * i + 1) / w % 1  # of one of the two teeth
+            height = round(0.3 * h * (1 - abs(along * 2 - 1)))
+            box[h - thick - height : h - thick, i] = STEEL
+    elif tile.islower() and pressed:
+        box[-thick:] = SUNK
+    elif tile.islower():
+        box[-2 * thick :] = PLATE
+    elif tile.isupper():
+        bars = np.arange(w) // max(1, w // 3) % 2 == 0
+        bottom = h // 5 if pressed else h - thick
+        box[:bottom, bars] = STEEL
 
 
 def paint_agent(box: np.ndarray, facing: int, dead: int) -> None:
-    """Paint the agent over a tile, (h, w, 3) uint8, in place: above its floor, the sprite sampled to that size."""
-    lines = np.array([list(line if facing else line[::-1]) for line in SPRITE[dead].split()])
-    h, w = len(box) - max(1, len(box) // 8), box.shape[1]
-    body = lines[np.minimum((2 * np.arange(h) + 1) * 12 // (2 * h), 11)][:, (2 * np.arange(w) + 1) * 6 // (2 * w)]
+    """Paint the agent over a tile, (h, w, 3) uint8, in place: above its floor, sampled to size."""
+    drawing = DEAD if dead else ALIVE
+    sprite = np.array([list(line) for line in drawing.split()])  # (12, 6)
+    if not facing:
+        sprite = sprite[:, ::-1]
+    height = len(box) - max(1, len(box) // 8)
+    width = box.shape[1]
+    rows = (2 * np.arange(height) + 1) * 12 // (2 * height)
+    columns = (2 * np.arange(width) + 1) * 6 // (2 * width)
+    body = sprite[rows][:, columns]  # (height, width)
     for letter, colour in COLOURS.items():
-        box[:h][body == letter] = colour
+        box[:height][body == letter] = colour
 
 
-# ---- the emulators (3.2, 5, 6.1; S3.2-01, S3.2-02, S5-*, S6.1-01, S6.1-07, S6.2-01, S6.2-02) --------
+# ---- The emulators (3.2, 5, 6.1; S3.2-01, S3.2-02, S5-*, S6.1-01, S6.1-07, S6.2-01, S6.2-02) -----
 
-FRAMESKIP = 4  # emulator frames a step (6.1)
+FRAMESKIP = 4  # emulator frames a step (S6.1-01)
+GRAY = np.array([299, 587, 114], np.float32)  # of red, green and blue, in 1/1000
 
 
-def _overlaps(pixels: int, size: int) -> np.ndarray:
-    """(size, pixels): how much of each pixel, in 1/size of it, lies in each of `size` equal parts."""
-    part, pixel = np.arange(size)[:, None] * pixels, np.arange(pixels) * size
-    return (np.minimum(part + pixels, pixel + size) - np.maximum(part, pixel)).clip(0).astype(float)
+def overlaps(pixels: int, size: int) -> np.ndarray:
+    """(size, pixels): how much of each pixel, in 1/size of it, lies in each of `size` parts."""
+    part = np.arange(size)[:, None] * pixels
+    pixel = np.arange(pixels) * size
+    end = np.minimum(part + pixels, pixel + size)
+    begin = np.maximum(part, pixel)
+    return (end - begin).clip(0).astype(float)
 
 
 class EmulatorEnv(PersistentEnv):
-    """What the emulators share: preprocessing (6.1), snapshots (3.2) and the end of an episode (R23).
-    Observations are the last frame of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8. The reward is 0.0.
-    info holds the subclass's readings of RAM, and "blank": no pixel is lit (R24). A subclass has _tick and _ram, sets _emulator
-    and its _screen, _save and _load, then calls _begin."""
+    """What the emulators share: preprocessing (6.1), snapshots (3.2), the end of an episode (R23).
+
+    A frame is the last one of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8.
+    The reward is 0.0. info holds the readings of RAM, and "blank": no pixel is lit (R24).
+    InputError: an action out of range, and any use after close().
+
+    A subclass sets _emulator, has _screen, _save, _load, _tick, _ram and _place, then calls _begin.
+    """
 
     LIVES = "lives"  # the reading whose drop ends the episode
     level: int | None = None  # the level whose leaving ends it, where RAM tells the level
+    _emulator = None  # None: closed
 
-    def _begin(self, game: bytes, actions: int, frame_size: int) -> None:
+    def _begin(self, game, actions, frame_size):
         """Make the present state s_init. `game` keeps the snapshots of different games apart."""
         self.action_space = gymnasium.spaces.Discrete(actions)
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
@@ -322,105 +638,174 @@ class EmulatorEnv(PersistentEnv):
         self._dictionary = game + self._frame + self._save()
         self._start = self.snapshot()
 
-    def _observe(self) -> np.ndarray:
-        luma = self._screen().astype(np.float32) @ np.float32([299, 587, 114])  # (H, W)
-        down, across = (_overlaps(pixels, self.observation_space.shape[0]) for pixels in luma.shape)
-        return (down @ np.rint(luma / 1000) @ across.T // luma.size).astype(np.uint8)  # whole numbers: exact everywhere
+    def _observe(self):
+        """The screen, (H, W, 3) uint8, as an observation."""
+        luma = np.rint(self._screen().astype(np.float32) @ GRAY / 1000)  # (H, W)
+        size = self.observation_space.shape[0]
+        down = overlaps(luma.shape[0], size)
+        across = overlaps(luma.shape[1], size)
+        # Whole numbers as far as the division, so exact on every machine.
+        return (down @ luma @ across.T // luma.size).astype(np.uint8)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def _check_open(self):
+        if self._emulator is None:
+            raise InputError("the emulator is closed: make the environment anew")
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Back to s_init, the same state every time. Returns (frame, info)."""
         super().reset(seed=seed)
         frame = self.restore(self._start)
-        return frame, {**self._ram(), "blank": not frame.any()}
+        return frame, self._info(frame)
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: int):
         """Four emulator frames of one action. Returns (frame, 0.0, terminated, False, info)."""
+        self._check_open()
+        check_action(action, self.action_space.n)
         lives = self._ram()[self.LIVES]
         for _ in range(FRAMESKIP):
-            self._tick(action)
-        frame, ram = self._observe(), self._ram()
+            self._tick(int(action))
+        frame = self._observe()
         self._frame = frame.tobytes()
-        ended = ram[self.LIVES] < lives or ram.get("level") != self.level
-        return frame, 0.0, ended, False, {**ram, "blank": not frame.any()}
+        info = self._info(frame)
+        ended = info[self.LIVES] < lives or info.get("level") != self.level
+        return frame, 0.0, ended, False, info
+
+    def _info(self, frame):
+        return {**self._ram(), "blank": not frame.any()}
 
     def snapshot(self) -> bytes:
-        """The emulator's whole state and the frame, as emulators restore no screen; bytes, compressed."""
+        """The emulator's whole state and the frame, as emulators restore no screen; compressed."""
+        self._check_open()
         packer = zlib.compressobj(level=2, zdict=self._dictionary)
         return packer.compress(self._frame + self._save()) + packer.flush()
 
     def restore(self, snapshot: bytes) -> np.ndarray:
-        """Load a snapshot, at no step; returns its frame. InputError: damaged, or of another s_init."""
-        unpacker, pixels = zlib.decompressobj(zdict=self._dictionary), len(self._frame)
+        """Load a snapshot, at no step; gives its frame. InputError: damaged, of another s_init."""
+        self._check_open()
+        unpacker = zlib.decompressobj(zdict=self._dictionary)
         try:
-            content = unpacker.decompress(snapshot)  # zlib compares the checksums of dictionary and content
-            loaded = unpacker.eof and not unpacker.unused_data and self._load(content[pixels:]) is not False
+            # zlib compares the checksums of dictionary and content.
+            content = unpacker.decompress(snapshot)
         except (zlib.error, TypeError):
-            loaded = False
-        if not loaded:
+            content = b""
+        whole = unpacker.eof and not unpacker.unused_data
+        pixels = len(self._frame)
+        if not whole or not self._load(content[pixels:]):
             raise InputError("the snapshot is damaged, or of another game, level or start state")
         self._frame = content[:pixels]
-        return np.frombuffer(self._frame, np.uint8).reshape(self.observation_space.shape).copy()
+        frame = np.frombuffer(self._frame, np.uint8)
+        return frame.reshape(self.observation_space.shape).copy()
+
+    def unit(self) -> tuple[int, int, int] | None:
+        """The coverage unit, (room, column, row), or None; see the subclass."""
+        self._check_open()
+        return self._place(self._ram())
 
     def close(self) -> None:
         """Release the emulator: stable-retro allows one at a time in a process."""
-        self._emulator = self._screen = self._save = self._load = None
+        self._emulator = None
 
 
 class PrinceOfPersia(EmulatorEnv):
     """One level of Prince of Persia on the NES, through stable-retro (section 5).
-    rom: the user's cartridge image, an iNES file. state: the gzip of an emulator state, as the authors publish them (level 1: in
-    the sword's room with the sword, 6.2). As a state has no screen, s_init comes one frame without buttons after it. Without
-    `state`, s_init is one second after power-on: only for a cartridge that is then in play on `level`, as no action is START.
-    The clock is held at 99 minutes. info: level, room, x, y (pixels), hit_points and sword, and "blank".
-    InputError: an unusable file, another level's state, no stable-retro, a second emulator in the process."""
 
-    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # section 5; NO-OP names no button
-    # Units in the full coverage sets of levels 1 to 14, counted from the authors' reference data (R26).
+    rom: the user's cartridge image, an iNES file.
+    state: the gzip of an emulator state, as the authors publish them (level 1: in the sword's room
+    with the sword, 6.2). As a state has no screen, s_init comes one frame without buttons after it.
+    Without `state`, s_init is one second after power-on: only for a cartridge that is then in play
+    on `level`, as no action is START.
+    The clock is held at 99 minutes.
+    info: level, room, x, y (pixels), hit_points, sword, blank.
+
+    unit() is (room, x // 32, y // 32), and None of the dead, outside the room (left of it x wraps
+    to 65535) and outside the level. %Cov is an estimate: the sets counted in FULL_COVERAGE hold
+    only the positions that the authors' reference allows, so the units visited may outnumber them
+    (744 of 721 on level 1). Without these sets we cannot drop the others; the caller cuts at 1.
+
+    InputError: an unusable file, another level's state, no stable-retro, a second emulator in the
+    process.
+    """
+
+    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # S5-02; NO-OP names no button
+    # Units in the full coverage sets of levels 1 to 14, from the authors' reference data (R26).
     FULL_COVERAGE = (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
     LIVES = "hit_points"
     unit_name = "units of 32 x 32 pixels"
 
-    def __init__(self, rom: str | None = None, level: int = 1, state: str | None = None, frame_size: int = 96):
+    def __init__(
+        self,
+        rom: str | None = None,
+        level: int = 1,
+        state: str | None = None,
+        frame_size: int = 96,
+    ):
         if not isinstance(level, int) or level not in range(1, 15):
             raise InputError(f"Prince of Persia has levels 1 to 14, not {level}")
         if not rom:
             raise InputError("Prince of Persia needs your own cartridge image: --rom FILE.nes")
         try:
             image = Path(rom).read_bytes()
-            start = gzip.decompress(Path(state).read_bytes()) if state else b""
+            start = gzip.decompress(Path(state).read_bytes()) if state else None
         except (OSError, EOFError, zlib.error) as error:
-            raise InputError(f"cannot read the cartridge or its start state: {error}") from None
+            raise InputError(f"cannot read the cartridge or start state: {error}") from None
         if image[:4] != b"NES\x1a" or len(image) < 16 + 16384 * image[4]:
             raise InputError(f"{rom} is no complete NES cartridge image (iNES)")
+        self.level = level
+        self.full_coverage = self.FULL_COVERAGE[level - 1]
+        self._start_emulator(rom, image)
+        self._enter(start, state or rom)
+        game = b"%d %d" % (zlib.crc32(image), level)
+        self._begin(game, len(self.ACTIONS), frame_size)
+
+    def _start_emulator(self, rom, image):
         try:
             import stable_retro
         except ImportError:
-            raise InputError("Prince of Persia needs stable-retro: pip install stable-retro") from None
-        # The core goes by the suffix and reads the file once: a copy will do, and nothing stays behind.
+            raise InputError(
+                "Prince of Persia needs stable-retro: pip install stable-retro"
+            ) from None
+        # The core goes by the suffix and reads the file once: a copy will do, nothing stays behind.
         with tempfile.TemporaryDirectory() as folder:
-            Path(folder, "rom.nes").write_bytes(image)
+            copy = Path(folder, "rom.nes")
+            copy.write_bytes(image)
             try:
-                self._emulator = stable_retro.RetroEmulator(f"{folder}/rom.nes")
+                self._emulator = stable_retro.RetroEmulator(str(copy))
             except RuntimeError as error:
                 hint = ": close() the first" if "multiple" in str(error) else ""
-                raise InputError(f"the emulator does not take {rom}: {error}{hint}") from None
+                raise InputError(f"the emulator refuses {rom}: {error}{hint}") from None
         self._data = stable_retro.data.GameData()
         self._emulator.configure_data(self._data)
-        self._screen = self._emulator.get_screen  # (224, 240, 3)
-        self._save, self._load = self._emulator.get_state, self._emulator.set_state
         buttons = stable_retro.get_system_info("Nes")["buttons"]
-        self._masks = np.array([[button == name for button in buttons] for name in self.ACTIONS], np.uint8)
-        self.level, self.full_coverage = level, self.FULL_COVERAGE[level - 1]
-        # The core takes any bytes of the right length, and may then hang: look for a state's mark first.
-        loaded = not state or start[:3] == b"FCS" and self._load(start)
-        for _ in range(1 if state else 60):
+        masks = [[button == action for button in buttons] for action in self.ACTIONS]
+        self._masks = np.array(masks, np.uint8)
+
+    def _enter(self, start, name):
+        """Go to s_init, from the start state or from power-on; `name` is the file to blame."""
+        problem = f"is not in play on level {self.level}"
+        loaded = True
+        ticks = 60
+        if start is not None:
+            # The core takes any bytes of that length, and may then hang: look for the mark first.
+            loaded = start[:3] == b"FCS" and self._load(start)
+            ticks = 1
+            problem += ", or the state is of another cartridge"
+        for _ in range(ticks):
             self._tick(0)
-        ram = self._ram()
-        if not loaded or self.unit() is None or ram["hit_points"] == 0:
+        if not loaded:
+            problem = "is no state of this emulator"
+        if not loaded or self.unit() is None:
+            ram = self._ram()
             self.close()
-            problem = f"is not in play on level {level}: {ram}" if loaded else "is no state of this emulator"
-            raise InputError(f"{state or rom} {problem}")
-        self._begin(b"%d %d" % (zlib.crc32(image), level), len(self.ACTIONS), frame_size)
+            raise InputError(f"{name} {problem}: {ram}")
+
+    def _screen(self):
+        return self._emulator.get_screen()  # (224, 240, 3)
+
+    def _save(self):
+        return self._emulator.get_state()
+
+    def _load(self, state):
+        return self._emulator.set_state(state)
 
     def _tick(self, action):
         self._emulator.set_button_mask(self._masks[action])
@@ -429,20 +814,32 @@ class PrinceOfPersia(EmulatorEnv):
 
     def _ram(self):
         read = self._data.memory.extract
-        return {"level": read(112, "|u1") + 1, "room": read(1246, "|u1"), "x": read(1243, "<u2"),
-                "y": read(1777, "|u1") & 224, "hit_points": read(1743, "|u1"), "sword": read(1774, "|u1")}
+        return {
+            "level": read(112, "|u1") + 1,
+            "room": read(1246, "|u1"),
+            "x": read(1243, "<u2"),
+            "y": read(1777, "|u1") & 224,
+            "hit_points": read(1743, "|u1"),
+            "sword": read(1774, "|u1"),
+        }
 
-    def unit(self) -> tuple[int, int, int] | None:
-        """(room, x // 32, y // 32). None of the dead, outside the room (left of it x wraps to 65535) or the level."""
-        ram = self._ram()
-        valid = ram["level"] == self.level and ram["x"] <= 332 and 32 <= ram["y"] <= 192 and ram["hit_points"]
-        return (ram["room"], ram["x"] // 32, ram["y"] // 32) if valid else None
+    def _place(self, ram):
+        playing = ram["level"] == self.level and ram["hit_points"] > 0
+        inside = ram["x"] <= 332 and 32 <= ram["y"] <= 192
+        if not playing or not inside:
+            return None
+        return ram["room"], ram["x"] // 32, ram["y"] // 32
 
 
 class Montezuma(EmulatorEnv):
-    """Montezuma's Revenge through ale-py, which brings the game: not in the paper, but needs no cartridge.
-    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames, which rollbacks would
-    reach. ALE's minimal actions, all 18. No full coverage set is known. info: room, x, y (ALE pixels), lives, "blank"."""
+    """Montezuma's Revenge through ale-py, which brings the game: not in the paper.
+
+    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames,
+    which rollbacks would reach. ALE's minimal actions, all 18. No full coverage set is known.
+    info: room, x, y (ALE pixels), lives, blank.
+    unit() is (room, column, row) of 16 pixels: a tenth of the screen's width, as a plate is of the
+    Prince's room.
+    """
 
     unit_name = "units of 16 x 16 pixels"
 
@@ -452,40 +849,82 @@ class Montezuma(EmulatorEnv):
         except ImportError:
             raise InputError("Montezuma's Revenge needs ale-py: pip install ale-py") from None
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
-        self._emulator = ale = ale_py.ALEInterface()
+        ale = ale_py.ALEInterface()
         ale.setFloat("repeat_action_probability", 0.0)
         ale.setInt("random_seed", 0)  # of numbers drawn to no effect, but part of the state
         ale.loadROM(ale_py.roms.get_rom_path("montezuma_revenge"))
         ale.reset_game()
-        self._screen, self._actions = ale.getScreenRGB, ale.getMinimalActionSet()
-        self._save = lambda: ale.cloneState(include_rng=True).serialize()
-        self._load = lambda state: ale.restoreState(ale_py.ALEState(state))
+        self._emulator = ale
+        self._state_type = ale_py.ALEState
+        self._actions = ale.getMinimalActionSet()
         self._begin(b"Montezuma", len(self._actions), frame_size)
+
+    def _screen(self):
+        return self._emulator.getScreenRGB()  # (210, 160, 3)
+
+    def _save(self):
+        return self._emulator.cloneState(include_rng=True).serialize()
+
+    def _load(self, state):
+        self._emulator.restoreState(self._state_type(state))
+        return True
 
     def _tick(self, action):
         self._emulator.act(self._actions[action])
 
     def _ram(self):
-        room, x, y, lives = self._emulator.getRAM()[[3, 42, 43, 58]].tolist()
-        return {"room": room, "x": x, "y": y, "lives": lives}
+        ram = self._emulator.getRAM().tolist()
+        return {"room": ram[3], "x": ram[42], "y": ram[43], "lives": ram[58]}
 
-    def unit(self) -> tuple[int, int, int]:
-        """(room, column, row) of 16 pixels: a tenth of the screen's width, as a plate is of the Prince's room."""
-        room, x, y, _ = self._ram().values()
-        return room, x // 16, 15 - y // 16  # RAM counts y upwards
+    def _place(self, ram):
+        return ram["room"], ram["x"] // 16, 15 - ram["y"] // 16  # RAM counts y upwards
 
 
-# ---- The factory by name -----------------------------------------------------------------------------------------
+# ---- Coverage units (5; S5-03, S5-04), and actions -----------------------------------------------
+
+
+def unit_key(unit) -> tuple[int | str, ...] | None:
+    """A coverage unit as a hashable tuple of plain ints and strs, or None.
+
+    unit: an int, a str, or a tuple, list or array of them. InputError: anything else. A float is
+    refused, as nan differs from itself and would be a new unit at each step.
+    """
+    if unit is None:
+        return None
+    parts = unit.tolist() if isinstance(unit, np.ndarray) else unit
+    if not isinstance(parts, tuple | list):
+        parts = [parts]
+    key = []
+    for part in parts:
+        if isinstance(part, str):
+            key.append(str(part))
+        elif isinstance(part, int | np.integer | np.bool_):
+            key.append(int(part))
+        else:
+            raise InputError(
+                f"unit() gives {unit!r:.60}: it must give an int, a str, a tuple of them, or None"
+            )
+    return tuple(key)
+
+
+def check_action(action: int, count: int) -> None:
+    """Raise InputError unless `action` is one of 0 to count - 1."""
+    if action not in range(count):
+        raise InputError(f"there are actions 0 to {count - 1}, and not {action!r}")
+
+
+# ---- The factory by name -------------------------------------------------------------------------
 
 gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
 ENVIRONMENTS = {"maze": Maze, "pop": PrinceOfPersia, "montezuma": Montezuma}
 
 
 def make_env(name: str, **options) -> PersistentEnv:
-    """The environment of that name; options are its constructor's. Raises InputError for unknown ones."""
+    """The environment of that name; options are its constructor's. InputError: unknown ones."""
     if name not in ENVIRONMENTS:
         raise InputError(f"unknown environment {name!r}: there are {', '.join(ENVIRONMENTS)}")
     known = inspect.signature(ENVIRONMENTS[name]).parameters
-    if unknown := [option for option in options if option not in known]:
-        raise InputError(f"{name} has no option {unknown[0]!r}: it has {', '.join(known)}")
+    for option in options:
+        if option not in known:
+            raise InputError(f"{name} has no option {option!r}: it has {', '.join(known)}")
     return ENVIRONMENTS[name](**options)
