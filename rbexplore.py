@@ -1,37 +1,39 @@
-"""RbExplore, as its paper says it: Ugadiarov, Skrynnik, Panov, "Long-Term Exploration in Persistent MDPs".
+"""RbExplore, as its paper says it: Ugadiarov, Skrynnik, Panov, "Long-Term Exploration in Persistent
+MDPs".
 
-The agent explores without rewards. It rolls back to stored snapshots of the environment, clusters the states
-that it meets by a learned similarity R, and starts again from rarely visited clusters. An iteration has five
-steps (section 4), the five calls of `RbExplore.iterate`:
+The agent explores without rewards. It rolls back to stored snapshots of the environment, clusters
+the states that it meets by a learned similarity R, and starts again from rarely visited clusters.
+An iteration has five steps (section 4). They are the five calls of `RbExplore.iterate`:
 
     1  explore            sample M clusters of G, roll back to each, walk with pi_explore
-    2  make_pairs         label pairs of states; walk on from L novel states for more pairs; prefixes
+    2  make_pairs         walk on from L novel states; label pairs of states, full prefixes included
     3  train_similarity   train R on the pairs of this iteration
-    4  update_graph       add the states of step 1 to G; every 15th iteration, merge similar clusters
+    4  update_graph       add the states of step 1 to G; every 15th iteration merge similar clusters
     5  train_novelty      train the novelty module (RND) on the states of step 1
 
-    symbol              here                        meaning
-    s, snap             frame, snapshot             a state: its observation, and the simulator's saved bytes
-    tau                 Trajectory                  states s_1 ... s_T that follow one another
-    pi_explore          walk                        uniform over the actions
-    R(s_1, s_2)         SimilarityModel             in [0, 1]: are the two states close in time?
-    n, N                Config.n, .N                closer than n steps: similar; more than N apart: dissimilar
-    G = (V, E)          Graph.clusters, .arcs       clusters, and the arcs between them
-    v = (s, snap)       Cluster                     a cluster is its centre
-    E_parent, prefix    Cluster.parent, .path       the cluster that v came from; the states in between
-    theta_sim, _merge   Config.theta_sim, ...       thresholds on R: to join a cluster; to merge two
-    B, beta, L          novel, Config.beta, .L      novel states; what is novel; how many of them are sampled
-    M                   Config.M                    exploration trajectories an iteration
+    symbol              here                         meaning
+    s, snap             State.frame, .snapshot       a state: its observation, the simulator's bytes
+    tau                 Trajectory                   states s_1 ... s_T that follow one another
+    pi_explore          walk                         uniform over the actions
+    R(s_1, s_2)         SimilarityModel              in [0, 1]: are the two states close in time?
+    n, N                Config.n, Config.N           closer than n: similar; further than N: not
+    G = (V, E)          Graph.clusters, Graph.arcs   clusters and the arcs between them
+    v = (s, snap)       Cluster                      a cluster is its centre
+    E_parent            Graph.E_parent               the arc from v to the cluster it came from
+    theta_sim           Config.theta_sim             threshold of R to join a cluster
+    theta_merge         Config.theta_merge           threshold of R to merge two clusters
+    B, beta, L          B, Config.beta, Config.L     novel states; what is novel; how many are drawn
+    M                   Config.M                     exploration trajectories an iteration
 
-"S4.2-03" is a statement of the paper and names its test; "R13" is our reading where the paper is silent or
-unclear. The README lists both.
+"S4.2-03" is a statement of the paper and names its test; "R13" is our reading where the paper is
+silent or unclear. The README lists both. A step is an agent step: one action, after the frameskip
+(R1).
 """
 
 import argparse
-import copy
+import contextlib
 import functools
 import io
-import itertools
 import json
 import math
 import multiprocessing
@@ -39,1245 +41,1543 @@ import os
 import pathlib
 import platform
 import signal
-import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections import Counter, deque
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, fields, replace
 
+import filelock
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers.utils import RunningMeanStd
 from torch import nn
 from torch.nn import functional as F
-from torch.utils.checkpoint import checkpoint_sequential
+from tqdm import tqdm
 
-from envs import InputError, Maze, check_contract, make_env
+from envs import InputError, check_contract, make_env, unit_key
 
-try:
-    import resource
-except ImportError:  # Windows has none
-    resource = None
-
-# ---------------------------------------------------------------------------- configuration (6.1; S6.1-05, 08, 09, 12)
+# ---------------------------------- configuration (6.1; S6.1-05, S6.1-08, S6.1-09, S6.1-12)
 
 
-def option(default, meaning, low=-10**9, high=10**9, choices=None):
-    """A field of the configuration: its meaning is the text of --help, its range is checked."""
-    return field(default=default, metadata={"meaning": meaning, "low": low, "high": high, "choices": choices})
-
-
-def check_fields(config) -> None:
-    """Raise InputError for a value of the wrong type or out of its range."""
-    for f in fields(config):
-        value, (low, high, choices) = getattr(config, f.name), (f.metadata[key] for key in ("low", "high", "choices"))
-        types = (int, float) if f.type is float else f.type
-        if not isinstance(value, types) or isinstance(value, bool) and f.type is not bool:
-            raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
-        if f.type in (int, float) and not low <= value <= high:
-            raise InputError(f"{f.name} is {value}: give a number from {low:,} to {high:,}")
-        if choices and value not in choices:
-            raise InputError(f"{f.name} is {value!r}: choose {' or '.join(choices)}")
+def option(default, meaning, low=-math.inf, high=math.inf):
+    """A field of the configuration: what --help says of it, and its range."""
+    return field(default=default, metadata={"meaning": meaning, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's configuration: the defaults are its values, the same for every level. A step is an agent step:
-    one action, after the frameskip (R1). Raises InputError for a value that cannot work."""
+    """The paper's configuration: the defaults are its values, the same for every level.
+
+    Raises InputError for a value that cannot work."""
 
     seed: int = option(0, "every generator is made from it", 0, 2**63)
-    steps: int = option(15_000_000, "agent steps in all: exploration, additional, pretraining (6.2, R2)", 1)
+    steps: int = option(15_000_000, "agent steps in all, pretraining included (6.2, R2)", 1, 10**12)
     pretrain_steps: int = option(500_000, "steps of pretraining; then G is reset (6.1)", 0)
-    M: int = option(30, "exploration trajectories an iteration (6.1)", 1)
+    M: int = option(30, "exploration trajectories an iteration (6.1)", 1, 10**6)
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
-    trim: int = option(0, "last states of a trajectory that G ignores (R10)", 0)
     L: int = option(1000, "novel states to walk on from, at most, an iteration (6.1)", 0)
-    additional_steps: int = option(50, "longest additional trajectory, steps (R3)", 1)
-    beta: float = option(2.5, "a state is novel above this intrinsic reward, standard deviations (6.1, R4)")
-    novelty_window: int = option(5, "latest iterations whose errors standardise the reward (R4)", 1)
-    keep_buffer: bool = option(False, "keep the novel states of earlier iterations in B (R5)")
+    additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
+    beta: float = option(2.5, "a state is novel above it, in standard deviations (6.1, R4)")
     n: int = option(5, "pairs closer than this are similar, steps (6.1)", 1)
     N: int = option(25, "pairs further apart than this are dissimilar, steps (6.1)", 1)
-    prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: the ablation of 6.3)")
+    prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
     epochs: int = option(4, "passes of R over the pairs of an iteration (R19)", 1)
-    replay_iterations: int = option(0, "earlier iterations whose pairs R trains on again (R19)", 0)
     theta_sim: float = option(0.5, "a state joins a cluster above this R (6.1)", 0, 1)
     theta_merge: float = option(0.5, "two clusters merge above this R (6.1)", 0, 1)
-    merge: bool = option(True, "merge clusters (4.2; off: the ablation of 6.3)")
-    merge_every: int = option(15, "iterations from one merge to the next, those of pretraining counted (6.1, R28)", 1)
-    max_clusters: int = option(0, "make no cluster beyond so many; 0: no bound, as in the paper", 0)
-    frame_size: int = option(96, "height and width of an observation, pixels (5)", 32)
-    encoder: str = option("resnet18", "network that embeds a frame for R (6.1)", choices=("resnet18", "small"))
-    embedding: int = option(512, "size of a frame's embedding (6.1)", 1)
-    head_width: int = option(512, "width of R's fully connected layers (R20)", 1)
-    r_learning_rate: float = option(1e-4, "Adam's, for R (R18)", 0)
-    r_anneal: bool = option(False, "R's learning rate falls to 0 within each iteration, linearly (R18)")
-    r_batch: int = option(256, "pairs in a batch (R18)", 2)
-    r_clip: float = option(1.0, "bound on the norm of R's gradient (R18)", 0)
-    rnd_encoder: str = option("nature", "network of RND (R18)", choices=("nature", "small"))
-    rnd_features: int = option(512, "size of RND's output (R18)", 1)
-    rnd_learning_rate: float = option(1e-4, "Adam's, for RND (R18)", 0)
-    rnd_batch: int = option(256, "states in a batch (R18)", 1)
+    merge: bool = option(True, "merge clusters (4.2; off: ablation of 6.3)")
+    merge_every: int = option(15, "iterations from one merge to the next (6.1, R28)", 1)
+    frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
+    small_networks: bool = option(False, "small encoders for R and RND, not ResNet-18 (6.1)")
+    embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
+    head_width: int = option(512, "width of fully connected layers (R20)", 1)
+    learning_rate: float = option(1e-4, "Adam's (R18)", 0)
+    r_batch: int = option(256, "pairs in a batch of R (R18)", 2)
+    rnd_batch: int = option(256, "states in a batch of RND (R18)", 1)
+    rollout_steps: int = option(16_384, "RND and ICM: steps of an iteration (6.2, R27)", 1)
+    episode_steps: int = option(4_500, "RND and ICM: longest episode, steps (6.2, R27)", 1)
 
     def __post_init__(self):
-        check_fields(self)
+        self.check_fields()
         if self.n > self.N:
-            raise InputError(f"n is {self.n} and N is {self.N}: a distance cannot be both similar and dissimilar; give n <= N")
+            raise InputError(
+                f"n is {self.n} and N is {self.N}: a pair cannot be both similar and "
+                "dissimilar; give n <= N"
+            )
         for name in ("trajectory_steps", "additional_steps"):
             if getattr(self, name) <= self.N:
-                raise InputError(f"{name} is {getattr(self, name)}: a negative pair is more than N = {self.N} steps apart, "
-                                 f"so there would be none; give at least {self.N + 1}")
+                raise InputError(
+                    f"{name} is {getattr(self, name)}: no two states would be more "
+                    f"than N = {self.N} steps apart; give at least {self.N + 1}"
+                )
         if self.pretrain_steps >= self.steps:
-            raise InputError(f"pretrain_steps is {self.pretrain_steps} of {self.steps} steps: nothing is left to explore; "
-                             "give more steps, or less pretraining")
+            raise InputError(
+                f"pretrain_steps is {self.pretrain_steps} of {self.steps} steps: "
+                "nothing is left to explore; give more steps, or less pretraining"
+            )
+
+    def check_fields(self):
+        for f in fields(self):
+            value = getattr(self, f.name)
+            low = f.metadata["low"]
+            high = f.metadata["high"]
+            whole_number_for_float = f.type is float and type(value) is int
+            if type(value) is not f.type and not whole_number_for_float:
+                raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
+            if not low <= value <= high:
+                raise InputError(f"{f.name} is {value}: give a number from {low:,} to {high:,}")
 
 
-# The maze's: what a small image, a small budget and a CPU need; the rest is the paper's.
-MAZE = Config(steps=100_000, pretrain_steps=8_000, M=20, trajectory_steps=150, L=20, frame_size=32,
-              encoder="small", embedding=64, head_width=128, r_learning_rate=1e-3, r_anneal=True, r_batch=128,
-              rnd_encoder="small", rnd_features=64, rnd_learning_rate=1e-3, rnd_batch=64)
+# What a small image, a small budget and a CPU need; all else is the paper's. n and N: R30.
+MAZE = Config(
+    steps=100_000,
+    pretrain_steps=4_000,
+    M=10,
+    trajectory_steps=150,
+    L=10,
+    additional_steps=20,
+    n=2,
+    N=10,
+    frame_size=32,
+    small_networks=True,
+    embedding=64,
+    head_width=128,
+    learning_rate=1e-3,
+    r_batch=128,
+    rnd_batch=64,
+    rollout_steps=1_024,
+    episode_steps=150,
+)
 CONFIGS = {"paper": Config(), "maze": MAZE}
 
-# ------------------------------------------------------------------------------------ the algorithm (4; S4-01 ... S4-07)
+# --------------------------------------------------------------- the algorithm (4; S4-01 ... S4-07)
 
-PURPOSES = ("init", "sample", "explore", "buffer", "additional", "pairs", "prefix", "rates", "similarity", "novelty")
-_owners = itertools.count()
+
+@dataclass
+class Iteration:
+    """What one iteration did, for whoever prints, traces, saves or tests it."""
+
+    metrics: dict
+    trajectories: list = field(default_factory=list)  # of step 1
+    additional: list = field(default_factory=list)  # of step 2
+    pairs: list = field(default_factory=list)  # of step 2: triples (s_1, s_2, y)
+    merged: dict = field(default_factory=dict)  # of step 4: cluster -> what it merged into
 
 
 class RbExplore:
     """The algorithm of section 4.
 
-    env_fn: makes the persistent environment (envs.PersistentEnv says what that is); where the executor has processes, it
-    must pickle. executor: any concurrent.futures.Executor, to run trajectories in; the result is the same for each.
-    tell: hears of progress (step, done, total), of every decision, and of each complete iteration (row).
-    Raises InputError for an environment that breaks the contract, FloatingPointError for a loss that is not finite."""
+    env_fn makes the persistent environment (envs.PersistentEnv says what that is); with an executor
+    of processes it must pickle. device is where the networks are. executor, any of
+    concurrent.futures, walks the trajectories; the result is the same for each. Raises InputError
+    for an environment that breaks the contract, or a loss that is not finite."""
 
-    def __init__(self, env_fn: Callable, config: Config | None = None, device: str = "cpu", executor=None,
-                 tell: Callable = lambda event, **data: None):
-        self.config, self.env_fn, self.executor, self.tell = config or Config(), env_fn, executor, tell
-        self.env, self.owner = env_fn(), f"{os.getpid()}.{next(_owners)}"
-        check_contract(self.env)
-        self.s_init = self.env.reset(seed=self.config.seed)[0].copy()
-        self.snap_init, self.unit_init = self.env.snapshot(), unit_key(self.env.unit())
-        self.similarity = SimilarityModel(self.config, self.s_init.shape, device)
-        self.novelty = RND(self.config, self.s_init.shape, device)
-        self.graph = Graph(self.s_init, self.snap_init, self.config)
-        self.phase, self.iteration, self.steps, self.exploration_steps = "pretrain", 0, 0, 0
-        self.discovered: dict[tuple, int] = {}  # coverage unit -> the step at which it was first visited
-        self.novel: list[bytes] = []  # B: snapshots of novel states
-        self.replay: deque[Pairs] = deque(maxlen=self.config.replay_iterations)
+    def __init__(self, env_fn, config=None, device="cpu", executor=None):
+        self.config = config or Config()
+        self.env_fn = env_fn
+        self.executor = executor
+        self.env = env_fn()
+        check_contract(self.env, self.config.seed)
+        frame, _ = self.env.reset(seed=self.config.seed)
+        self.initial_state = State(np.array(frame), self.env.snapshot())
+        self.initial_unit = unit_key(self.env.unit())
+        # Layers draw first weights from torch's global generator, which is left as it was.
+        with torch.random.fork_rng(devices=[]):
+            self.similarity = SimilarityModel(self.config, frame.shape, device)
+            self.novelty = RND(self.config, frame.shape, device)
+        self.graph = Graph(self.initial_state)
+        self.pretraining = True
+        self.iteration = 0
+        self.steps = 0
+        self.discovered: dict[tuple, int] = {}  # coverage unit -> step of its first visit
+        self.worker_key = uuid.uuid4().hex  # by which a worker knows whose environment it has
 
-    def run(self) -> "RbExplore":
+    def iterate(self) -> Iteration:
+        """One iteration: the paper's five steps, in the paper's order."""
+        check_budget(self)
+        if self.pretraining and self.steps >= self.config.pretrain_steps:
+            self.restart()
+        self.iteration += 1
+        # Made anew each iteration, so that a checkpoint needs none; one for each step that draws.
+        rng = np.random.default_rng([self.config.seed, self.iteration])
+        rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
+        theta_sim = self.theta_sim()
+        clusters_before = self.graph.created
+
+        trajectories = self.explore(rng_1)
+        pairs, additional = self.make_pairs(trajectories, rng_2)
+        r_metrics = self.train_similarity(pairs, rng_3)
+        merged = self.update_graph(trajectories, theta_sim)
+        rnd_loss = self.train_novelty(trajectories, rng_5)
+
+        novelty = np.concatenate([tau.novelty for tau in trajectories])
+        metrics = {
+            **progress_metrics(self),
+            "theta_sim": theta_sim,
+            "clusters": len(self.graph.clusters),
+            "added": self.graph.created - clusters_before,
+            "merged": len(merged),
+            "novel_share": float(np.mean(novelty > self.config.beta)),
+            "additional": len(additional),
+            **r_metrics,
+            "rnd_loss": rnd_loss,
+        }
+        return Iteration(metrics, trajectories, additional, pairs, merged)
+
+    def run(self):
         """Iterate until the budget of steps is spent."""
         while self.steps < self.config.steps:
             self.iterate()
         return self
 
-    def iterate(self) -> dict:
-        """One iteration: the paper's five steps in the paper's order. Returns its metrics."""
-        check_budget(self)
-        if self.phase == "pretrain" and self.steps >= self.config.pretrain_steps:
-            self.restart()
-        self.iteration += 1
-        self.row = {"iteration": self.iteration, "phase": self.phase, "theta_sim": self.theta_sim()}
-        self.tell("iteration", **self.row)
+    def restart(self):
+        """The end of pretraining (6.1; S6.1-15): G is reset to the initial state, R and RND are
+        kept (R6), and coverage starts (R2)."""
+        self.pretraining = False
+        self.graph = Graph(self.initial_state)
+        if self.initial_unit is not None:
+            self.discovered[self.initial_unit] = self.steps
 
-        trajectories = self.explore()
-        pairs = self.make_pairs(trajectories)
-        self.train_similarity(pairs)
-        self.update_graph(trajectories)
-        self.train_novelty(trajectories)
-
-        self.row |= counts(self) | {"clusters": len(self.graph.clusters)}
-        self.tell("row", row=self.row)
-        return self.row
-
-    def restart(self) -> None:
-        """The end of pretraining: G is reset to s_init, R and RND are kept, coverage starts (6.1, R2, R6; S6.1-15)."""
-        self.phase, self.novel, self.graph = "explore", [], Graph(self.s_init, self.snap_init, self.config)
-        self.discovered |= {} if self.unit_init is None else {self.unit_init: self.steps}
-        self.tell("restart")
-
-    def theta_sim(self) -> float:
+    def theta_sim(self):
         """The threshold; in pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
-        share = self.steps / self.config.pretrain_steps if self.phase == "pretrain" else 1
-        return self.config.theta_sim * share
+        if not self.pretraining:
+            return self.config.theta_sim
+        return self.config.theta_sim * self.steps / self.config.pretrain_steps
 
-    def seed(self, purpose: str, index: int = -1) -> list[int]:
-        """A seed for each purpose of each iteration, so that nothing random is carried from one to the next."""
-        return [self.config.seed, self.iteration, PURPOSES.index(purpose), index + 1]
+    def explore(self, rng):
+        """Step 1: sample M clusters, roll back to each, explore (S4-01, S6.1-06, S6.1-11).
 
-    def rng(self, purpose: str) -> np.random.Generator:
-        return np.random.default_rng(self.seed(purpose))
-
-    def explore(self) -> list["Trajectory"]:
-        """Step 1: sample M clusters, with replacement (R12), roll back to each, walk (S4-01, S4.2-12, S6.1-06, S6.1-11)."""
-        ids, probabilities = self.graph.sampling_distribution()
-        chosen = self.rng("sample").choice(ids, size=self.config.M, p=probabilities).tolist()
-        self.tell("sample", clusters=ids, probabilities=probabilities.tolist(), chosen=chosen)
-        trajectories = self.collect("explore", [self.graph.clusters[v].snapshot for v in chosen], self.config.trajectory_steps)
-        for tau, v in zip(trajectories, chosen, strict=False):  # fewer, where the budget of steps ended
+        Clusters are drawn with replacement, as G begins with a single one (R12)."""
+        clusters, probabilities = self.graph.sampling_distribution()
+        sampled = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
+        centres = [self.graph.clusters[v] for v in sampled]
+        covers = not self.pretraining
+        trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
+        for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the budget ended
             tau.start = v
-            check_rollback(tau, self.graph.clusters[v])
+            tau.prefix = self.graph.full_prefix(v)
+        check_lengths(trajectories)
         return trajectories
 
-    def collect(self, purpose: str, snapshots: list[bytes], steps: int) -> list["Trajectory"]:
-        """Walk at most `steps` steps from each snapshot. Every step costs one, whatever it serves (R2), and none is taken
-        beyond the budget (S6.2-04). Only exploration covers units (R25)."""
-        end = self.config.pretrain_steps if self.phase == "pretrain" else self.config.steps
-        trajectories: list[Trajectory] = []
-        while len(trajectories) < len(snapshots) and self.steps < end:
-            todo = list(range(len(trajectories), len(snapshots)))
-            if len(todo) * steps > end - self.steps:  # they might not all fit: one at a time
-                todo = todo[:1]
-            jobs = [(snapshots[k], self.seed(purpose, k), min(steps, end - self.steps), purpose == "explore") for k in todo]
-            for tau in walks(self, jobs):
+    def collect(self, starts, steps, covers, rng):
+        """Roll back to each state and walk at most `steps` steps.
+
+        Each step counts, whatever it serves (R2), and none is taken beyond the budget (S6.2-04), so
+        there may be fewer trajectories. covers: whether its steps count for coverage (R25)."""
+        end = self.config.pretrain_steps if self.pretraining else self.config.steps
+        seeds = rng.integers(2**63, size=len(starts)).tolist()
+        jobs = list(zip(starts, seeds, strict=True))
+        trajectories = []
+        bar = progress(total=len(jobs), what="walk")
+        while len(trajectories) < len(jobs) and self.steps < end:
+            left = end - self.steps
+            surely = max(1, left // steps)  # so many fit into the budget, however long they get
+            batch = jobs[len(trajectories) :][:surely]
+            for tau in walks(self, batch, min(steps, left)):
                 for unit in tau.units:
                     self.steps += 1
-                    self.exploration_steps += purpose == "explore"
-                    if purpose == "explore" and self.phase == "explore" and unit is not None:
-                        self.discovered.setdefault(unit_key(unit), self.steps)
+                    if covers and unit is not None:
+                        self.discovered.setdefault(unit, self.steps)
                 trajectories.append(tau)
-                self.tell("progress", step=purpose, done=len(trajectories), total=len(snapshots))
+                bar.update()
+        bar.close()
         return trajectories
 
-    def make_pairs(self, trajectories: list["Trajectory"]) -> "Pairs":
-        """Step 2: label pairs of exploration and of additional trajectories, and pairs with their prefixes (S4-02, S4.1-09)."""
-        additional = self.additional_trajectories(trajectories)
-        pairs, rng, prefix_rng = Pairs(), self.rng("pairs"), self.rng("prefix")  # so --no-prefix leaves the rest alone
-        for source, taus in (("exploration", trajectories), ("additional", additional)):
-            for tau in taus:
-                pairs.add_trajectory(source, tau.frames, self.config, rng)
-                if self.config.prefix and tau.start:  # from cluster 0, the initial one, there is none (S4.1-09, S4.2-21; R30)
-                    prefix = self.graph.clusters[tau.start].path.states() + list(tau.since)
-                    pairs.add_prefix(source, tau.frames, prefix, self.config, prefix_rng)
-        self.tell("pairs", **pairs.counts)
-        return pairs
+    def make_pairs(self, trajectories, rng):
+        """Step 2: pairs of exploration and of additional trajectories (S4-02), and pairs with their
+        full prefixes (S4.1-09, R29). Returns the pairs and the additional trajectories."""
+        additional = self.walk_on_from_novel_states(trajectories, rng)
+        pairs = []
+        for tau in trajectories + additional:
+            pairs += pairs_within(tau.frames, self.config.n, self.config.N, rng)
+        if self.config.prefix:
+            for tau in trajectories + additional:
+                pairs += pairs_with_prefix(tau.frames, tau.prefix, self.config.N, rng)
+        return pairs, additional
 
-    def additional_trajectories(self, trajectories: list["Trajectory"]) -> list["Trajectory"]:
-        """Put novel states into B, sample L of it, walk on from them (S4.2-15 ... S4.2-18). They serve R alone."""
-        self.novel = self.novel if self.config.keep_buffer else []
-        before = len(self.novel)
-        origin: dict[bytes, tuple[Trajectory, int]] = {}  # a novel state: the (latest) trajectory that met it, and where
-        for k, tau in enumerate(trajectories):
-            reward = self.novelty.reward(tau.frames)  # (T,)
-            found = np.flatnonzero(reward > self.config.beta)
-            self.novel += [tau.snapshots[i] for i in found]
-            origin |= {tau.snapshots[i]: (tau, i) for i in found}
-            if len(found):
-                self.tell("novel", trajectory=k, states=found.tolist(), reward=reward[found].tolist())
-        novel_share = (len(self.novel) - before) / sum(len(tau.frames) for tau in trajectories)
-        sample = [self.novel[i] for i in self.rng("buffer").permutation(len(self.novel))[: self.config.L]]
-        additional = self.collect("additional", sample, self.config.additional_steps)
-        for tau, snapshot in zip(additional, sample, strict=False):  # fewer, where the budget of steps ended
-            if snapshot in origin:  # else it is of an earlier iteration (keep_buffer), whose trajectories are gone
-                met, i = origin[snapshot]
-                tau.start, tau.since = met.start, met.frames[1 : i + 1]
-        self.row |= {"novel_share": novel_share, "additional": len(additional)}
+    def walk_on_from_novel_states(self, trajectories, rng):
+        """Put the novel states into B, sample L of them, walk on from these (S4.2-15 ... S4.2-18).
+
+        B holds the novel states of this iteration only (R5). The walks serve R alone."""
+        B = []  # a novel state: its trajectory, and its index there
+        for tau in trajectories:
+            tau.novelty = self.novelty.reward(tau.frames)
+            B += [(tau, i) for i in np.flatnonzero(tau.novelty > self.config.beta)]
+        sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]
+        novel_states = [State(tau.frames[i], tau.snapshots[i]) for tau, i in sample]
+        additional = self.collect(novel_states, self.config.additional_steps, False, rng)
+        for walked, (tau, i) in zip(additional, sample, strict=False):  # fewer, as in `explore`
+            walked.start = tau.start
+            # The full prefix goes on from tau's, along tau, to the novel state (R29).
+            walked.prefix = tau.prefix[:-1] + list(tau.frames[: i + 1])
         return additional
 
-    def train_similarity(self, pairs: "Pairs") -> None:
-        """Step 3: train R on this iteration's pairs (S4-03, S4-06); first measure it on them, while they are unseen."""
-        self.row |= rates(self.similarity, pairs, self.rng("rates"))
-        training = Pairs.joined([*self.replay, pairs])  # `replay` keeps none by default (R19)
-        self.row["r_loss"] = self.similarity.fit(training, self.config, self.rng("similarity"), self.tell)
-        self.replay.append(pairs)
+    def train_similarity(self, pairs, rng):
+        """Step 3: train R on this iteration's pairs and no others (S4-03, S4-06). Returns metrics:
+        how often it was right on them before, while they were unseen, and its loss."""
+        true_positive, true_negative = self.similarity.rates(pairs, rng)
+        loss = self.similarity.fit(pairs, rng)
+        return {"r_tpr": true_positive, "r_tnr": true_negative, "r_loss": loss}
 
-    def update_graph(self, trajectories: list["Trajectory"]) -> None:
-        """Step 4: add the exploration trajectories to G; every 15th iteration then merge (S4-04, S6.1-10, S6.3-01)."""
-        before = len(self.graph.clusters)
-        self.graph.embed_centres(self.similarity)  # R has changed since: old embeddings are stale
-        for k, tau in enumerate(trajectories):
-            decisions = self.graph.add_trajectory(tau, self.similarity, self.row["theta_sim"])
-            self.tell("assign", trajectory=k, start=tau.start, **decisions)
-            self.tell("progress", step="update", done=k + 1, total=len(trajectories))
-        self.row |= {"added": len(self.graph.clusters) - before, "merged": 0}
+    def update_graph(self, trajectories, theta_sim):
+        """Step 4: add the states of the exploration trajectories to G; every 15th iteration merge
+        (S4-04, S6.1-10, S6.3-01). Returns which cluster merged into which."""
+        self.graph.embed_centres(self.similarity)  # R has changed: the old embeddings are stale
+        for tau in progress(trajectories, "update G"):
+            self.graph.add_trajectory(tau, self.similarity, theta_sim)
         if self.config.merge and self.iteration % self.config.merge_every == 0:
-            merged = self.graph.merge(self.similarity, self.config.theta_merge)
-            self.tell("merge", merged=merged)
-            self.row["merged"] = len(merged)
+            return self.graph.merge(self.similarity, self.config.theta_merge)
+        return {}
 
-    def train_novelty(self, trajectories: list["Trajectory"]) -> None:
-        """Step 5: train RND, last, on the states of the exploration trajectories and no others (S4-05)."""
-        self.row["rnd_loss"] = self.novelty.fit([tau.frames for tau in trajectories], self.rng("novelty"), self.tell)
+    def train_novelty(self, trajectories, rng):
+        """Step 5: train RND, last, on the states of the exploration trajectories and no others
+        (S4-05). Returns its loss."""
+        return self.novelty.fit([tau.frames for tau in trajectories], rng)
+
+    def state_dict(self):
+        """All that a run needs to go on, as plain data and tensors."""
+        return {
+            "pretraining": self.pretraining,
+            "iteration": self.iteration,
+            "steps": self.steps,
+            "discovered": self.discovered,
+            "similarity": self.similarity.state_dict(),
+            "novelty": self.novelty.state_dict(),
+            "graph": self.graph.state_dict(),
+        }
+
+    def load_state_dict(self, state):
+        """Take over the state of a run of the same configuration and environment."""
+        self.pretraining = state["pretraining"]
+        self.iteration = state["iteration"]
+        self.steps = state["steps"]
+        self.discovered = state["discovered"]
+        self.similarity.load_state_dict(state["similarity"])
+        self.novelty.load_state_dict(state["novelty"])
+        self.graph.load_state_dict(state["graph"])
 
 
-# ----------------------------------------------------- step 1: trajectories of a persistent MDP (3.2, 4.2; S3.2-01, 02)
+# ------------------------- step 1: trajectories of a persistent MDP (3.2, 4.2; S3.2-01, S3.2-02)
+
+
+@dataclass
+class State:
+    """s and snap: an observation, (H, W) or (H, W, C) uint8, and the bytes that restore it."""
+
+    frame: np.ndarray
+    snapshot: bytes
 
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1) ... (s_T, snap_T); the terminal state of a death is not one of them (R10)."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). The terminal state of a death is no state (R10)."""
 
     frames: np.ndarray  # (T, H, W) uint8
-    snapshots: list[bytes]  # T; none for an additional trajectory
-    actions: list[bytes]  # T; actions[t] lead from state t-1 to state t: one, or more across blank frames (R24)
+    snapshots: list[bytes]  # T
+    actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
-    start: int | None = None  # the cluster it started from; for an additional one, that of the trajectory that met its s_1
-    since: np.ndarray | tuple = ()  # (k, H, W) the states from that cluster's centre (exclusive) to s_1: additional ones only
+    ended: bool  # by the environment, and not by the number of steps
+    start: int = 0  # the cluster it began from; an additional one: its exploration began from
+    prefix: list[np.ndarray] = field(default_factory=list)  # the full prefix s_init ... s_1
+    novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
+    clusters: list[int] = field(default_factory=list)  # T; the cluster of each state, from step 4
 
 
-def walk(env, snapshot: bytes, seed: list[int], steps: int, keep_snapshots: bool) -> Trajectory:
-    """Roll back to `snapshot`, which costs no step, and follow pi_explore, uniform over the actions (6.1; S4.2-02), for
-    `steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments alone."""
-    frames, snapshots, actions, units, since = [env.restore(snapshot).copy()], [snapshot], [b""], [], b""
-    for action in np.random.default_rng(seed).integers(env.action_space.n, size=steps).tolist():
-        frame, _, terminated, truncated, info = env.step(action + int(env.action_space.start))
-        units.append(env.unit())
-        since += bytes([action])
-        if terminated:
-            break
-        if not info.get("blank"):  # a black transition frame is stepped and counted, but it is no state (R24)
-            frames.append(frame.copy())
-            actions.append(since)
-            since = b""
-            if keep_snapshots:
-                snapshots.append(env.snapshot())
-        if truncated:
-            break
-    return Trajectory(np.stack(frames), snapshots if keep_snapshots else [], actions, units)
+def walk(env, start, seed, steps):
+    """Roll back to `start` and follow pi_explore, uniform over the actions (6.1; S4.2-02), for
+    `steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments
+    alone."""
+    rng = np.random.default_rng(seed)
+    roll_back(env, start)
+    frames = [start.frame]
+    snapshots = [start.snapshot]
+    actions = [b""]
+    units = []
+    since_state = b""  # the actions since the last state
+    ended = False
+    while len(units) < steps and not ended:
+        action = int(rng.integers(env.action_space.n))
+        frame, _, terminated, truncated, info = env.step(int(env.action_space.start) + action)
+        units.append(unit_key(env.unit()))
+        since_state += bytes([action])
+        ended = bool(terminated or truncated)
+        blank = info.get("blank", False)  # a transition screen is stepped and counted (R24)
+        if not terminated and not blank:
+            frames.append(np.array(frame))
+            snapshots.append(env.snapshot())
+            actions.append(since_state)
+            since_state = b""
+    return Trajectory(np.stack(frames), snapshots, actions, units, ended)
 
 
-# -------------------------------------------------------------------- step 2: training pairs (4.1; S4.1-02 ... S4.1-09)
+def roll_back(env, state):
+    """Return to a state, at no step (S3.2-02). InputError: it gives another frame (S4-01)."""
+    if not np.array_equal(env.restore(state.snapshot), state.frame):
+        raise InputError(
+            "restore() did not give the frame of its snapshot again: part of the "
+            "state is not in the snapshot; see PersistentEnv in envs.py"
+        )
 
 
-@dataclass
-class Pairs:
-    """The training data D: pairs (s_1, s_2, y)."""
-
-    states: list[np.ndarray] = field(default_factory=list)  # frames, (H, W) uint8
-    index: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))  # (D, 2) s_1 and s_2 among `states`
-    y: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))  # (D,) 1 similar, 0 dissimilar
-    counts: Counter = field(default_factory=Counter)  # pairs of each kind
-
-    def add_trajectory(self, source: str, frames: np.ndarray, config: Config, rng: np.random.Generator) -> None:
-        """(a), (b) of figure 2: each state with a state less than n away, and one more than N away if there is one; both
-        are drawn uniformly from those of the same trajectory (R17). frames: (T, H, W)."""
-        T, i, base = len(frames), np.arange(len(frames)), len(self.states)
-        near = rng.integers(np.maximum(i - (config.n - 1), 0), np.minimum(i + config.n, T))
-        before = np.maximum(i - config.N, 0)  # so many states lie more than N before i: 0 ... i-N-1
-        after = np.maximum(T - 1 - config.N - i, 0)  # and after it: i+N+1 ... T-1
-        i_far = np.flatnonzero(before + after)
-        k = rng.integers((before + after)[i_far])
-        far = np.where(k < before[i_far], k, k - before[i_far] + i_far + config.N + 1)
-        self.states += list(frames)
-        self._add(f"{source} positive", base + i, base + near, 1, rng)
-        self._add(f"{source} negative", base + i_far, base + far, 0, rng)
-
-    def add_prefix(self, source: str, frames: np.ndarray, prefix: list[np.ndarray], config: Config,
-                   rng: np.random.Generator) -> None:
-        """(c) of figure 2: each state i of the trajectory added last with a state j of its full prefix, drawn from all that
-        are more than N away along the joined path (S4.2-22, S4.2-23, R16)."""
-        i, base = np.arange(len(frames)), len(self.states)
-        # The prefix ends with the state that the trajectory begins with, so (P - 1 - j) + i steps lie in between.
-        eligible = np.clip(len(prefix) - 1 - config.N + i, 0, len(prefix))
-        i = np.flatnonzero(eligible)
-        self.states += [prefix[j] for j in rng.integers(eligible[i])]
-        self._add(f"{source} prefix", base - len(frames) + i, base + np.arange(len(i)), 0, rng)
-
-    def _add(self, kind: str, s_1: np.ndarray, s_2: np.ndarray, y: int, rng: np.random.Generator) -> None:
-        index = np.stack([s_1, s_2], axis=1)  # (k, 2)
-        swap = rng.random(len(index)) < 0.5  # a prefix state always comes first: the order must not give it away (R17)
-        index[swap] = index[swap, ::-1]
-        self.index, self.y = np.concatenate([self.index, index]), np.append(self.y, np.full(len(index), y))
-        self.counts[kind] += len(index)
-
-    @staticmethod
-    def joined(parts: list["Pairs"]) -> "Pairs":
-        starts = np.cumsum([0] + [len(part.states) for part in parts])
-        return Pairs([s for part in parts for s in part.states],
-                     np.concatenate([part.index + start for part, start in zip(parts, starts, strict=False)]),
-                     np.concatenate([part.y for part in parts]), sum((part.counts for part in parts), Counter()))
-
-    def balanced(self, rng: np.random.Generator, most: int | None = None) -> np.ndarray:
-        """As many positive as negative pairs, at most `most` of each, in random order: indices of pairs (R17)."""
-        classes = [rng.permutation(np.flatnonzero(self.y == y)) for y in (0, 1)]
-        size = min(*map(len, classes), most or len(self.y))
-        return rng.permutation(np.concatenate([c[:size] for c in classes]))
-
-    def frames(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The states s_1 and the states s_2 of the chosen pairs, (B, H, W) each."""
-        return tuple(np.array([self.states[s] for s in self.index[chosen, side].tolist()]) for side in (0, 1))
+def walks(algorithm, jobs, steps):
+    """`walk` from each state with its seed, in order: here, or in the executor's workers."""
+    if algorithm.executor is None:
+        return (walk(algorithm.env, start, seed, steps) for start, seed in jobs)
+    remote = functools.partial(walk_in_worker, algorithm.worker_key, algorithm.env_fn, steps)
+    return algorithm.executor.map(remote, *zip(*jobs, strict=True))
 
 
-# --------------------------------------------------- step 3: the similarity model R (4.1, 6.1; S4.1-08, S6.1-02 ... 04)
+_worker = threading.local()  # the environment of this process or thread, and whose it is
+
+
+def walk_in_worker(owner, env_fn, steps, start, seed):
+    """`walk` in an environment that is made at the first job of its owner, and kept."""
+    if getattr(_worker, "owner", None) != owner:
+        if hasattr(_worker, "env"):
+            _worker.env.close()
+        _worker.env = env_fn()
+        _worker.env.reset()
+        _worker.owner = owner
+    return walk(_worker.env, start, seed, steps)
+
+
+def check_lengths(trajectories):
+    """Raise InputError where nearly all end at once, as they do behind a time limit."""
+    at_once = sum(tau.ended and len(tau.units) == 1 for tau in trajectories)
+    if at_once > 0.9 * len(trajectories):
+        raise InputError(
+            f"{at_once} of {len(trajectories)} trajectories ended at their first "
+            "step: is there a time limit, which a rollback does not set back? take "
+            "it out"
+        )
+
+
+# ------------------------------------------ step 2: training pairs (4.1, 4.2; S4.1-02 ... S4.1-09)
+
+# A pair is a triple (s_1, s_2, y): two frames, and y = 1 where they are similar (S4.1-07).
+
+
+def pairs_within(frames, n, N, rng):
+    """Figure 2 (a), (b): for each state of a trajectory (T, H, W) a similar one, and a dissimilar
+    one if there is any, each drawn from all of the same trajectory (R17)."""
+    pairs = []
+    position = np.arange(len(frames))
+    for i in range(len(frames)):
+        distance = np.abs(position - i)
+        similar = np.flatnonzero(distance < n)
+        pairs.append((frames[i], frames[rng.choice(similar)], 1))
+        dissimilar = np.flatnonzero(distance > N)
+        if len(dissimilar) > 0:
+            pairs.append((frames[i], frames[rng.choice(dissimilar)], 0))
+    return pairs
+
+
+def pairs_with_prefix(frames, prefix, N, rng):
+    """Figure 2 (c): for each state of a trajectory (T, H, W) a state of its full prefix, drawn from
+    all that are more than N steps away along the joined path (S4.2-22, S4.2-23, R16)."""
+    pairs = []
+    position = np.arange(len(prefix))
+    for i in range(len(frames)):
+        # The prefix ends with s_1, with which the trajectory begins.
+        distance = (len(prefix) - 1 + i) - position
+        distant = np.flatnonzero(distance > N)
+        if len(distant) > 0:
+            pairs.append((frames[i], prefix[rng.choice(distant)], 0))
+    return pairs
+
+
+def balanced(pairs, rng):
+    """As many similar as dissimilar pairs, in random order (R17)."""
+    similar = [pair for pair in pairs if pair[2] == 1]
+    dissimilar = [pair for pair in pairs if pair[2] == 0]
+    size = min(len(similar), len(dissimilar))
+    chosen = [similar[k] for k in rng.permutation(len(similar))[:size]]
+    chosen += [dissimilar[k] for k in rng.permutation(len(dissimilar))[:size]]
+    return [in_either_order(chosen[k], rng) for k in rng.permutation(2 * size)]
+
+
+def in_either_order(pair, rng):
+    """A prefix state that always came second would give its class away (R17)."""
+    s_1, s_2, y = pair
+    return (s_2, s_1, y) if rng.random() < 0.5 else pair
+
+
+def stack(pairs):
+    """Frames s_1 (B, H, W), frames s_2 (B, H, W), labels (B,)."""
+    s_1, s_2, y = zip(*pairs, strict=True)
+    return np.stack(s_1), np.stack(s_2), np.array(y)
+
+
+# --------- step 3: the similarity model R (4.1, 6.1; S4.1-01, S4.1-08, S6.1-02, S6.1-03, S6.1-04)
 
 
 class SimilarityModel(nn.Module):
-    """R_w(s_1, s_2): a shared encoder embeds both frames, four fully connected layers classify the two embeddings (6.1).
-    In evaluation mode, save within `fit`: R of a pair then depends on nothing else (S4.1-01)."""
+    """R_w(s_1, s_2): one encoder embeds both frames, four fully connected layers classify the two
+    embeddings (6.1). It is in evaluation mode but within `fit`, so that R of a pair depends on that
+    pair alone (S4.1-01). shape: of a frame, (H, W) or (H, W, C)."""
 
-    def __init__(self, config: Config, shape: tuple, device: str = "cpu"):
+    def __init__(self, config, shape, device="cpu"):
         super().__init__()
-        d, w, head = config.embedding, config.head_width, []
-        with torch.random.fork_rng(devices=[]):  # torch initialises too, from its global generator, which stays as it is
-            small = config.encoder == "small"
-            self.encoder = convolutions(shape, d, SMALL, norm=True) if small else resnet18(channels_of(shape), d)
-            for inputs, outputs in ((2 * d, w), (w, w), (w, w), (w, 1)):
-                head += [nn.BatchNorm1d(inputs), nn.ReLU(inplace=True), nn.Linear(inputs, outputs)]  # R20
-            self.head = nn.Sequential(*head)
-        initialise(self, config.seed).to(device, memory_format=torch.channels_last).eval()  # which is faster
-        self.device, self.optimiser = device, torch.optim.Adam(self.parameters(), lr=config.r_learning_rate)
+        self.epochs = config.epochs
+        self.batch_size = config.r_batch
+        self.device = device
+        if config.small_networks:
+            self.encoder = convolutions(SMALL, shape, config.embedding, batch_norm=True)
+        else:
+            self.encoder = ResNet18(channels_of(shape), config.embedding)
+        width = config.head_width
+        self.head = nn.Sequential(
+            *dense(2 * config.embedding, width),
+            *dense(width, width),
+            *dense(width, width),
+            *dense(width, 1),
+        )
+        initialise(self, config.seed)
+        self.to(device, memory_format=torch.channels_last)  # which is faster
+        self.eval()
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate, fused=True)
 
-    def forward(self, first: np.ndarray, second: np.ndarray) -> torch.Tensor:
-        """Frames (B, H, W) and (B, H, W) -> logits (B,)."""
-        embeddings = self.encoder(to_input(np.concatenate([first, second]), self.device))  # (2B, d)
-        return self.head(torch.cat(embeddings.chunk(2), dim=1)).squeeze(1)
+    def forward(self, s_1, s_2):
+        """Frames (B, H, W) twice -> logits of R (B,)."""
+        frames = to_input(np.concatenate([s_1, s_2]), self.device)  # (2B, C, H, W)
+        e_1, e_2 = self.encoder(frames).chunk(2)  # (B, d) each
+        return self.logits(e_1, e_2)
+
+    def logits(self, e_1, e_2):
+        """Embeddings (B, d) twice -> (B,)."""
+        return self.head(torch.cat([e_1, e_2], dim=1)).squeeze(1)
 
     @torch.no_grad()
-    def embed(self, frames: np.ndarray) -> torch.Tensor:
+    def embed(self, frames):
         """Frames (T, H, W) uint8 -> embeddings (T, d)."""
-        return torch.cat([self.encoder(to_input(part, self.device)) for part in chunks(frames)])
+        parts = [self.encoder(to_input(part, self.device)) for part in in_parts(frames)]
+        return torch.cat(parts)
 
     @torch.no_grad()
-    def probability(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-        """What the network says of embeddings (K, d) and (K, d) or (d,): (K,) in [0, 1]."""
-        return torch.sigmoid(self.head(torch.cat([first, second.expand_as(first)], dim=1))).squeeze(1)
+    def score(self, e_1, e_2):
+        """R of embeddings (K, d), and (K, d) or (d,) -> (K,) in [0, 1]."""
+        return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
-    @torch.no_grad()
-    def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-        """R of embeddings (K, d) and (K, d) or (d,) -> (K,). R(s, s) is 1, as s is no step away from itself: else a state that
-        the network finds unlike itself would make one more cluster at each visit (R29)."""
-        rounding = 1e-5 * first.abs().amax(1)  # of embeddings of equal frames, which may come from batches of different sizes
-        same = (first - second).abs().amax(1) <= rounding
-        return torch.where(same, 1.0, self.probability(first, second)).cpu().numpy()
-
-    def fit(self, pairs: Pairs, config: Config, rng: np.random.Generator, tell: Callable) -> float | None:
-        """Minimise the binary cross-entropy, `epochs` passes. Returns the mean loss of the last; None without pairs.
-        r_anneal lets the learning rate fall, so that the R that decides in step 4 hangs less on its last batches (R18)."""
+    def fit(self, pairs, rng):
+        """Minimise the binary cross-entropy, `epochs` passes (R19). Returns the mean loss of the
+        last; None where there are no pairs of both classes."""
+        losses = []
         self.train()
-        try:
-            for epoch in range(config.epochs):
-                order, losses = pairs.balanced(rng), []
-                batches = np.array_split(order, math.ceil(len(order) / config.r_batch) or 1)
-                for k, batch in enumerate(batches if len(order) else []):
-                    done, total = epoch * len(batches) + k, config.epochs * len(batches)
-                    self.optimiser.param_groups[0]["lr"] = config.r_learning_rate * (1 - config.r_anneal * done / total)
-                    losses.append(self.update(*pairs.frames(batch), pairs.y[batch], config.r_clip))
-                    tell("progress", step="train R", done=done + 1, total=total)
-        finally:
-            self.eval()
+        for _ in range(self.epochs):
+            chosen = balanced(pairs, rng)
+            losses = [
+                self.update(*stack(batch))
+                for batch in progress(batches(chosen, self.batch_size), "train R")
+            ]
+        self.eval()
         return float(np.mean(losses)) if losses else None
 
-    def update(self, first: np.ndarray, second: np.ndarray, y: np.ndarray, clip: float) -> float:
-        """One step on a batch: frames (B, H, W) twice, labels (B,). Returns the loss: -y log R - (1 - y) log(1 - R)."""
-        loss = F.binary_cross_entropy_with_logits(self(first, second), torch.from_numpy(y).float().to(self.device))
-        return descend(self.optimiser, loss, "R", clip)
+    def update(self, s_1, s_2, y):
+        """One step on frames (B, H, W) twice and labels (B,). Returns the loss before it, the mean
+        of -y log R - (1 - y) log(1 - R) (S4.1-08)."""
+        labels = torch.from_numpy(y).float().to(self.device)
+        loss = F.binary_cross_entropy_with_logits(self(s_1, s_2), labels)
+        descend(self.optimiser, loss, "R", max_norm=1.0)  # R18
+        return loss.item()
+
+    def rates(self, pairs, rng):
+        """How often R > 0.5 is right, of at most 1,000 pairs: true positive rate and true negative
+        rate; None and None where there are no pairs of both classes."""
+        chosen = balanced(pairs, rng)[:1000]
+        if not chosen:
+            return None, None
+        s_1, s_2, y = stack(chosen)
+        R = self.score(self.embed(s_1), self.embed(s_2))
+        return float(np.mean(R[y == 1] > 0.5)), float(np.mean(R[y == 0] <= 0.5))
+
+    def get_extra_state(self):
+        """What PyTorch's state_dict() keeps beside the weights."""
+        return self.optimiser.state_dict()
+
+    def set_extra_state(self, state):
+        self.optimiser.load_state_dict(state)
 
 
-# ----------------------------------------- step 4: the graph of clusters, prefixes, merge (4.2; S4.2-01 ... S4.2-29)
+# ------------------- step 4: the graph of clusters, prefixes, merge (4.2; S4.2-01 ... S4.2-29)
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
-    """A prefix: the states from a parent's centre (exclusive) to a cluster's centre, just as they were walked.
+@dataclass
+class Cluster(State):
+    """v = (s, snap): the centre of a cluster, and what G knows of it."""
 
-    Linked to the parent's own it is the full prefix s_init ... s. It never changes, merge or not, so distances along it
-    stay true, and its actions lead from s_init to s: they are the policy pi^p of section 3.2 (R15; S3.2-03)."""
-
-    parent: "Path | None"
-    frames: np.ndarray  # (k, H, W) uint8; the last one is the centre
-    actions: tuple[bytes, ...]  # k; actions[t] lead to frames[t]
-
-    def chain(self) -> list["Path"]:
-        """The links from s_init to this one."""
-        links = [self]
-        while links[-1].parent:
-            links.append(links[-1].parent)
-        return links[::-1]
-
-    def states(self) -> list[np.ndarray]:
-        """The full prefix s_init ... s, in the order of time."""
-        return [frame for link in self.chain() for frame in link.frames]
-
-    def replay(self) -> bytes:
-        """The actions that lead from s_init to s."""
-        return b"".join(action for link in self.chain() for action in link.actions)
-
-
-@dataclass(eq=False)
-class Cluster:
-    """v = (s, snap), and what G knows of it."""
-
-    frame: np.ndarray  # s, the centre, (H, W) uint8
-    snapshot: bytes
-    path: Path
-    parent: int | None  # its arc in E_parent; none for the initial cluster
     visits: int = 0  # states assigned to it, its own centre included (R11)
+    embedding: torch.Tensor | None = None  # (d,) of the centre, by the R of this iteration
+
+
+@dataclass(frozen=True)
+class ParentArc:
+    """An arc of E_parent, from a cluster to its parent, with the prefix as it was walked."""
+
+    parent: int
+    prefix: np.ndarray  # (k, H, W) from the parent's centre to the cluster's, both included
+    actions: bytes  # they lead from the one to the other
 
 
 class Graph:
-    """G. Clusters are numbered in the order of their creation; number 0 is (s_init, snap_init) (S4.2-11)."""
+    """G. Clusters are numbered in the order of creation; number 0 is the initial one (S4.2-11)."""
 
-    def __init__(self, s_init: np.ndarray, snap_init: bytes, config: Config):
-        self.trim, self.max_clusters = config.trim, config.max_clusters
-        self.clusters = {0: Cluster(s_init, snap_init, Path(None, s_init[None], (b"",)), None, visits=1)}
+    def __init__(self, initial_state):
+        initial = Cluster(initial_state.frame, initial_state.snapshot, visits=1)
+        self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
-        self.adjacent: dict[int, set[int]] = {0: set()}  # clusters at the other end of an arc, either way (R8)
-        self.created = self.assigned = 1  # clusters ever made; states ever assigned
-        self.refused = 0  # clusters that max_clusters prevented
+        self.adjacent: dict[int, set[int]] = {0: set()}  # ends of its arcs, either way (R8)
+        # For each cluster ever made, but for 0. No merge changes an entry, so that distances along
+        # a prefix stay true and its actions can be replayed: the policy pi^p of section 3.2 (R15).
+        self.E_parent: dict[int, ParentArc] = {}
+        self.created = 1  # clusters ever made
 
-    def sampling_distribution(self) -> tuple[list[int], np.ndarray]:
-        """sigma: the clusters, each with a probability inverse to its visits (6.1)."""
-        weights = 1 / np.array([v.visits for v in self.clusters.values()])
+    def sampling_distribution(self):
+        """sigma: the clusters, each with a probability inverse to its visits (6.1; S4.2-12)."""
+        weights = np.array([1 / v.visits for v in self.clusters.values()])
         return list(self.clusters), weights / weights.sum()
 
-    def embed_centres(self, similarity: SimilarityModel) -> None:
-        self.centres = similarity.embed(np.stack([v.frame for v in self.clusters.values()]))  # (V, d)
-        self.row = {v: row for row, v in enumerate(self.clusters)}
+    def embed_centres(self, similarity):
+        """Embed all centres by the R of now (S4-03)."""
+        embeddings = similarity.embed(np.stack([v.frame for v in self.clusters.values()]))
+        for v, embedding in zip(self.clusters.values(), embeddings, strict=True):
+            v.embedding = embedding
 
-    def add_trajectory(self, tau: Trajectory, similarity: SimilarityModel, theta: float) -> dict[str, list]:
-        """Assign every state in order: it joins a cluster, or makes one (S4.2-06). Returns the cluster of each state, the R
-        that decided it, and each new cluster with its parent."""
-        previous = parent = tau.start  # the first state is this cluster's centre (R9)
-        self.visit(previous)
-        clusters, scores, made, parent_at = [previous], [None], [], 0
+    def most_similar(self, ids, s_i, similarity, theta):
+        """Of these clusters the one whose centre s has the greatest R(s, s_i), if that is above
+        theta (S4.2-03, S4.2-04). s_i: an embedding (d,)."""
+        centres = torch.stack([self.clusters[v].embedding for v in ids])  # (K, d)
+        scores = similarity.score(centres, s_i)  # (K,)
+        best = int(scores.argmax())
+        return ids[best] if scores[best] > theta else None
+
+    def add_trajectory(self, tau, similarity, theta_sim):
+        """Each state in order joins a cluster or makes one (S4.2-06); successive states of
+        different clusters make an arc (S4.2-07, S4.2-08). tau.clusters then tells where each state
+        went."""
         embeddings = similarity.embed(tau.frames)  # (T, d)
-        for i in range(1, len(tau.frames) - self.trim):
-            cluster, score = self.find(embeddings[i], previous, similarity, theta)
-            if cluster is None:
-                cluster = self.create(tau, i, parent, parent_at, embeddings[i])
-                made.append((cluster, parent))
-                parent, parent_at = cluster, i  # the parent is the cluster made last, else the start (R13)
-            self.visit(cluster)
-            if cluster != previous:
-                self.add_arc(previous, cluster, 1)
+        cluster = tau.start  # s_1 is its centre (R9)
+        self.clusters[cluster].visits += 1
+        tau.clusters = [cluster]
+        parent = tau.start  # the cluster made last on this trajectory, else the start (R13)
+        parent_at = 0
+        for i in range(1, len(tau.frames)):
             previous = cluster
-            clusters.append(cluster)
-            scores.append(score)
-        return {"clusters": clusters, "R": scores, "made": made}
+            cluster = self.find(embeddings[i], previous, similarity, theta_sim)
+            if cluster is None:
+                cluster = self.create(tau, parent_at, i, parent)
+                self.clusters[cluster].embedding = embeddings[i]
+                parent = cluster
+                parent_at = i
+            self.clusters[cluster].visits += 1
+            if cluster != previous:
+                self.add_arc(previous, cluster, visits=1)
+            tau.clusters.append(cluster)
 
-    def find(self, s_i: torch.Tensor, previous: int, similarity: SimilarityModel, theta: float) -> tuple[int | None, float]:
-        """The cluster with R(centre, s_i) > theta and that R: the best adjacent to the previous one, or else the best of
-        all, or else none (S4.2-03, 04, 05, 13; R7). s_i: (d,)."""
-        for ids in (sorted(self.adjacent[previous] | {previous}), list(self.clusters)):
-            scores = similarity.score(self.centres[[self.row[v] for v in ids]], s_i)
-            best = int(scores.argmax())
-            if scores[best] > theta:
-                return ids[best], float(scores[best])
-        if self.max_clusters and len(ids) >= self.max_clusters:
-            self.refused += 1
-            return ids[best], float(scores[best])
-        return None, float(scores[best])
+    def find(self, s_i, previous, similarity, theta_sim):
+        """The cluster to which s_i belongs, an embedding (d,): the most similar of the previous one
+        and those adjacent to it (S4.2-13, R8), else of all (R7), else None (S4.2-05)."""
+        nearby = sorted({previous} | self.adjacent[previous])
+        found = self.most_similar(nearby, s_i, similarity, theta_sim)
+        if found is None:
+            found = self.most_similar(list(self.clusters), s_i, similarity, theta_sim)
+        return found
 
-    def create(self, tau: Trajectory, i: int, parent: int, parent_at: int, s_i: torch.Tensor) -> int:
-        """A cluster with state i of tau as its centre, and its prefix from its parent's centre (S4.2-01, 19, 20)."""
-        since = slice(parent_at + 1, i + 1)
-        path = Path(self.clusters[parent].path, tau.frames[since].copy(), tuple(tau.actions[since]))
-        new, self.created = self.created, self.created + 1
-        self.clusters[new] = Cluster(path.frames[-1], tau.snapshots[i], path, parent)
-        self.adjacent[new], self.row[new] = set(), len(self.centres)
-        self.centres = torch.cat([self.centres, s_i[None]])
+    def create(self, tau, parent_at, i, parent):
+        """Make a cluster of state i of tau, and its arc to the parent, whose centre is state
+        parent_at (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
+        new = self.created
+        self.created += 1
+        prefix = tau.frames[parent_at : i + 1].copy()  # a view would keep the whole of tau
+        actions = b"".join(tau.actions[parent_at + 1 : i + 1])
+        self.clusters[new] = Cluster(prefix[-1], tau.snapshots[i])
+        self.adjacent[new] = set()
+        self.E_parent[new] = ParentArc(parent, prefix, actions)
         return new
 
-    def visit(self, v: int) -> None:
-        self.clusters[v].visits += 1
-        self.assigned += 1
+    def add_arc(self, start, end, visits):
+        """Count so many crossings of the arc (start, end) (S4.2-10)."""
+        self.arcs[start, end] = self.arcs.get((start, end), 0) + visits
+        self.adjacent[start].add(end)
+        self.adjacent[end].add(start)
 
-    def add_arc(self, a: int, b: int, visits: int) -> None:
-        self.arcs[a, b] = self.arcs.get((a, b), 0) + visits
-        self.adjacent[a].add(b)
-        self.adjacent[b].add(a)
+    def lineage(self, v):
+        """From a child of the initial cluster down to v, each the parent of the next; empty for the
+        initial cluster itself (S4.2-19)."""
+        line = []
+        while v != 0:
+            line.append(v)
+            v = self.E_parent[v].parent
+        return line[::-1]
 
-    def merge(self, similarity: SimilarityModel, theta: float) -> list[tuple[int, int, float]]:
-        """Test all pairs: in the order of creation, each cluster joins the most similar earlier survivor with
-        R(earlier, later) > theta (S4.2-24, 25; R14). Returns (survivor, merged, R) for each."""
-        merged, kept = [], [0]
+    def full_prefix(self, v):
+        """The states s_init ... s on the way to the centre s of v, in the order of time; empty for
+        the initial cluster (S4.2-21)."""
+        states = []
+        for u in self.lineage(v):
+            del states[-1:]  # the parent's centre, with which the next prefix begins
+            states += list(self.E_parent[u].prefix)
+        return states
+
+    def replay(self, v):
+        """The actions that lead from s_init to the centre of v: pi^p of section 3.2 (S3.2-03)."""
+        return b"".join(self.E_parent[u].actions for u in self.lineage(v))
+
+    def merge(self, similarity, theta_merge):
+        """Test all pairs: in the order of creation, each cluster merges into the most similar
+        surviving earlier one with R(earlier, later) > theta_merge (S4.2-24, S4.2-25, R14). The
+        earlier one keeps its centre (S4.2-28) and inherits visits (S4.2-27) and arcs. Returns
+        {later: earlier}."""
+        merged = {}
+        survivors = [0]
         for later in list(self.clusters)[1:]:
-            scores = similarity.score(self.centres[[self.row[v] for v in kept]], self.centres[self.row[later]])
-            best = int(scores.argmax())
-            if scores[best] > theta:
-                self.absorb(kept[best], later)
-                merged.append((kept[best], later, float(scores[best])))
+            centre = self.clusters[later].embedding
+            earlier = self.most_similar(survivors, centre, similarity, theta_merge)
+            if earlier is None:
+                survivors.append(later)
             else:
-                kept.append(later)
-        self.centres = self.centres[[self.row[v] for v in kept]]
-        self.row = {v: row for row, v in enumerate(kept)}
+                merged[later] = earlier
+        for later, earlier in merged.items():
+            self.clusters[earlier].visits += self.clusters.pop(later).visits
+        self.redirect_arcs(merged)
+        # Of E_parent only the lineages of living clusters are kept (R15; S4.2-29).
+        needed = {u for v in self.clusters for u in self.lineage(v)}
+        self.E_parent = {v: arc for v, arc in self.E_parent.items() if v in needed}
         return merged
 
-    def absorb(self, earlier: int, later: int) -> None:
-        """The earlier cluster keeps its centre and inherits visits, arcs and children (S4.2-26 ... S4.2-29; R15)."""
-        self.clusters[earlier].visits += self.clusters.pop(later).visits
-        for a, b in [arc for arc in self.arcs if later in arc]:
-            visits, ends = self.arcs.pop((a, b)), (earlier if a == later else a, earlier if b == later else b)
-            if ends[0] != ends[1]:
-                self.add_arc(*ends, visits)
-        for other in self.adjacent.pop(later):
-            self.adjacent[other].discard(later)
-        for v in self.clusters.values():
-            if v.parent == later:  # a parent stays older than its child, so no cycle can arise
-                v.parent = earlier
+    def redirect_arcs(self, merged):
+        """Whatever arc was incident to a cluster is incident to the one it merged into; between the
+        two there is none (S4.2-26)."""
+        old_arcs = self.arcs
+        self.arcs = {}
+        self.adjacent = {v: set() for v in self.clusters}
+        for (start, end), visits in old_arcs.items():
+            start = merged.get(start, start)
+            end = merged.get(end, end)
+            if start != end:
+                self.add_arc(start, end, visits)
 
-    def check(self) -> None:
-        """Assert the invariants of G."""
-        ids, ends = list(self.clusters), {v: set() for v in self.clusters}
-        assert ids[0] == 0 and ids == sorted(ids), "the initial cluster stays, and comes first"
-        assert sum(v.visits for v in self.clusters.values()) == self.assigned, "visits are conserved"
-        for (a, b), visits in self.arcs.items():
-            assert a != b and visits > 0, "an arc was walked between two clusters"
-            ends[a].add(b)
-            ends[b].add(a)
-        assert ends == self.adjacent, "adjacent clusters are the ends of arcs"
-        for v, cluster in self.clusters.items():
-            assert (cluster.parent is None) == (v == 0), "every cluster but the first has a parent"
-            assert v == 0 or cluster.parent in self.clusters and cluster.parent < v, "which exists and is older"
-            assert cluster.path.chain()[0] is self.clusters[0].path, "every full prefix begins with s_init"
-            assert np.array_equal(cluster.path.frames[-1], cluster.frame), "and ends with the centre"
+    def state_dict(self):
+        """G without its embeddings, which each iteration makes anew."""
+        clusters = self.clusters.items()
+        parents = self.E_parent.items()
+        return {
+            "clusters": {v: (torch.from_numpy(c.frame), c.snapshot, c.visits) for v, c in clusters},
+            "arcs": self.arcs,
+            "E_parent": {v: (a.parent, torch.from_numpy(a.prefix), a.actions) for v, a in parents},
+            "created": self.created,
+        }
+
+    def load_state_dict(self, state):
+        clusters = state["clusters"].items()
+        parents = state["E_parent"].items()
+        self.clusters = {v: Cluster(s.numpy(), snap, visits) for v, (s, snap, visits) in clusters}
+        self.E_parent = {v: ParentArc(parent, s.numpy(), a) for v, (parent, s, a) in parents}
+        self.created = state["created"]
+        self.arcs = state["arcs"]
+        self.redirect_arcs({})  # which makes `adjacent`
 
 
-# -------------------------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
+# ------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
 
 
-class RND:
-    """Random network distillation (Burda et al. 2019): a predictor learns the output of a fixed random target network; its
-    error is large on states unlike those it was trained on."""
+class RND(nn.Module):
+    """Random network distillation (Burda et al. 2019): a predictor learns the output of a fixed
+    random target network; its error is large on states unlike those it was trained on."""
 
-    def __init__(self, config: Config, shape: tuple, device: str = "cpu"):
-        layers, out = SMALL if config.rnd_encoder == "small" else NATURE, config.rnd_features
-        with torch.random.fork_rng(devices=[]):
-            self.target = convolutions(shape, out, layers, norm=False)
-            self.predictor = nn.Sequential(copy.deepcopy(self.target), nn.ReLU(), nn.Linear(out, out), nn.ReLU(),
-                                           nn.Linear(out, out))
-        initialise(self.target, config.seed + 1).to(device)
-        initialise(self.predictor, config.seed + 2).to(device)
-        self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.rnd_learning_rate)
-        self.device, self.batch = device, config.rnd_batch
-        self.pixels = Moments()  # of each pixel, over all states trained on
-        self.errors: deque[Moments] = deque(maxlen=config.novelty_window)  # of the error on the states just learned
+    def __init__(self, config, shape, device="cpu"):
+        super().__init__()
+        d = config.embedding
+        layers = SMALL if config.small_networks else NATURE
+        self.batch_size = config.rnd_batch
+        self.device = device
+        self.target = convolutions(layers, shape, d, batch_norm=False)
+        self.predictor = nn.Sequential(
+            convolutions(layers, shape, d, batch_norm=False),
+            nn.ReLU(),
+            nn.Linear(d, d),
+            nn.ReLU(),
+            nn.Linear(d, d),
+        )
+        initialise(self.target, config.seed + 1)
+        initialise(self.predictor, config.seed + 2)
+        self.target.requires_grad_(False)
+        self.to(device)
+        self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.learning_rate)
+        self.pixels = RunningMeanStd(shape=shape)  # over all states trained on
+        self.recent_errors = deque(maxlen=5)  # one entry an iteration (R4)
 
-    def distance(self, frames: np.ndarray) -> torch.Tensor:
-        """Frames (B, H, W) -> the predictor's mean squared error (B,), on pixels standardised and clipped to +-5 (R4)."""
-        x = channels_first(torch.from_numpy(self.pixels.standardise(frames).clip(-5, 5).astype(np.float32)).to(self.device))
-        with torch.no_grad():
-            goal = self.target(x)
-        return (self.predictor(x) - goal).square().mean(1)
+    def forward(self, frames):
+        """Frames (B, H, W) -> the predictor's mean squared errors (B,), on observations
+        standardised and clipped to +-5 (R4)."""
+        z = (frames - self.pixels.mean) / np.sqrt(self.pixels.var + 1e-8)
+        z = z.clip(-5, 5).astype(np.float32)
+        x = channels_first(torch.from_numpy(z).to(self.device))  # (B, C, H, W)
+        return (self.predictor(x) - self.target(x)).square().mean(1)
 
     @torch.no_grad()
-    def reward(self, frames: np.ndarray) -> np.ndarray:
-        """The intrinsic reward: frames (T, H, W) -> (T,), errors in standard deviations from the mean of the latest
-        iterations' (R4). Changes nothing. Before the first training nothing is novel (R6)."""
-        recent = Moments()
-        for moments in self.errors:
-            recent.join(moments)
-        if not recent.count:
+    def errors(self, frames):
+        """Frames (T, H, W) -> errors (T,)."""
+        return np.concatenate([self(part).cpu().numpy() for part in in_parts(frames)])
+
+    def reward(self, frames):
+        """The intrinsic reward, frames (T, H, W) -> (T,): by how many standard deviations of the
+        latest iterations' errors an error exceeds their mean (R4). It changes nothing. Before the
+        first training nothing is novel (R6)."""
+        if not self.recent_errors:
             return np.full(len(frames), -np.inf)
-        return recent.standardise(np.concatenate([self.distance(part).cpu().numpy() for part in chunks(frames)]))
+        recent = np.concatenate(self.recent_errors)
+        return (self.errors(frames) - recent.mean()) / (recent.std() + 1e-8)
 
-    def fit(self, trajectories: list[np.ndarray], rng: np.random.Generator, tell: Callable) -> float:
-        """Update the normalisers and train the predictor, one pass; (T, H, W) each. Returns the mean loss.
+    def fit(self, trajectories, rng):
+        """Update the normalisers, then train the predictor, one pass over all states of
+        trajectories (T, H, W). Returns the mean loss."""
+        for frames in trajectories:
+            self.pixels.update(frames)
+        states = [frame for frames in trajectories for frame in frames]
+        order = rng.permutation(len(states))
+        losses = [
+            self.update(np.stack([states[k] for k in batch]))
+            for batch in progress(batches(order, self.batch_size), "train RND")
+        ]
+        # Taken after the learning: before it, the large errors of one new room would hide the next.
+        self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
+        return float(np.mean(losses))
 
-        The errors that make a reward comparable are those of the states just learned, after learning (R4): measured before,
-        the large errors of one new room would hide the next for as long as the window remembers them."""
-        parts = [part for frames in trajectories for part in chunks(frames)]
-        for part in parts:
-            self.pixels.join(Moments(part))
-        states, errors = [frame for frames in trajectories for frame in frames], []
-        batches = np.array_split(rng.permutation(len(states)), math.ceil(len(states) / self.batch))
-        for k, batch in enumerate(batches):
-            errors.append(self.update(np.stack([states[s] for s in batch])))
-            tell("progress", step="train RND", done=k + 1, total=len(batches))
-        with torch.no_grad():
-            self.errors.append(Moments(np.concatenate([self.distance(part).cpu().numpy() for part in parts])))
-        return float(np.mean(np.concatenate(errors)))
+    def update(self, frames):
+        """One step of the predictor on frames (B, H, W). Returns the mean error before it."""
+        loss = self(frames).mean()
+        descend(self.optimiser, loss, "RND")
+        return loss.item()
 
-    def update(self, frames: np.ndarray) -> np.ndarray:
-        """One step of the predictor on a batch (B, H, W). Returns the errors before it (B,)."""
-        error = self.distance(frames)
-        descend(self.optimiser, error.mean(), "RND")
-        return error.detach().cpu().numpy()
+    def get_extra_state(self):
+        """What PyTorch's state_dict() keeps beside the weights."""
+        return {
+            "optimiser": self.optimiser.state_dict(),
+            "pixels": statistics_state(self.pixels),
+            "recent_errors": [torch.from_numpy(errors) for errors in self.recent_errors],
+        }
 
-
-# ######################################################################################################################
-# What the five steps stand on: counts and rates, worker processes, running moments, the layers of the networks (6.1, R18).
-# ######################################################################################################################
-
-
-def check_budget(a) -> None:
-    if a.steps >= a.config.steps:
-        raise InputError(f"the budget of {a.config.steps} steps is spent: give more steps to go on")
-
-
-def counts(a) -> dict:
-    """Steps so far, and %Cov: units visited, of those of full coverage where these are known (5; S5-03)."""
-    full, units = getattr(a.env, "full_coverage", None), len(a.discovered)
-    return {"steps": a.steps, "exploration_steps": a.exploration_steps, "units": units,
-            "coverage": units / full if full else None}
+    def set_extra_state(self, state):
+        self.optimiser.load_state_dict(state["optimiser"])
+        load_statistics(self.pixels, state["pixels"])
+        self.recent_errors.clear()
+        self.recent_errors.extend(errors.numpy() for errors in state["recent_errors"])
 
 
-def rates(similarity: SimilarityModel, pairs: Pairs, rng: np.random.Generator, most: int = 500) -> dict[str, float]:
-    """How often the network's R > 0.5 is right, for at most `most` pairs of each class; empty without pairs."""
-    chosen = pairs.balanced(rng, most)
-    if not len(chosen):
-        return {}
-    first, second = map(similarity.embed, pairs.frames(chosen))
-    right = (similarity.probability(first, second).cpu().numpy() > 0.5) == pairs.y[chosen]
-    similar = pairs.y[chosen] == 1
-    return {"r_accuracy": float(right.mean()), "r_true_positive": float(right[similar].mean()),
-            "r_true_negative": float(right[~similar].mean())}
-
-
-def unit_key(unit) -> tuple | None:
-    """A coverage unit as a tuple of plain numbers or strings, or None."""
-    try:
-        key = None if unit is None else tuple(np.ravel(unit).tolist())
-        hash(key)
-    except (TypeError, ValueError):
-        raise InputError(f"unit() gives {unit!r}: it must give a number, a string, a tuple of them, or None") from None
-    return key
-
-
-def walks(a: RbExplore, jobs: list[tuple]):
-    """`walk` for each job, in their order: here, or in the executor's workers."""
-    if a.executor:
-        return a.executor.map(walk_remotely, [(a.owner, a.env_fn)] * len(jobs), jobs)
-    return (walk(a.env, *job) for job in jobs)
-
-
-def check_rollback(tau: Trajectory, start: Cluster) -> None:
-    """Raise InputError for an environment that did not come back to the centre, or whose frames are of another kind."""
-    if tau.frames.dtype != np.uint8 or not np.array_equal(tau.frames[0], start.frame):
-        raise InputError("restore() did not give the frame of its snapshot again, or step() gives frames that are not uint8: see "
-                         "PersistentEnv in envs.py")
-
-
-_worker = threading.local()  # an environment for each process, or thread, of an executor
-
-
-def walk_remotely(owner: tuple[str, Callable], job: tuple) -> Trajectory:
-    """`walk` in a worker, which makes an environment at its first job for this owner, and keeps it."""
-    if getattr(_worker, "owner", None) != owner[0]:
-        if getattr(_worker, "env", None):
-            _worker.env.close()
-        _worker.owner, _worker.env = owner[0], owner[1]()
-        _worker.env.reset()
-    return walk(_worker.env, *job)
-
-
-class Moments:
-    """Count, mean and variance of all batches so far, joined exactly (Chan et al. 1979), in float64."""
-
-    def __init__(self, batch: np.ndarray | None = None):
-        self.count, self.mean, self.m2 = 0, np.zeros(()), np.zeros(())
-        if batch is not None:  # (B, ...): moments of each entry
-            self.count, self.mean = len(batch), batch.mean(0, dtype=np.float64)
-            self.m2 = np.square(batch - self.mean).sum(0)
-
-    def join(self, other: "Moments") -> "Moments":
-        total, delta = self.count + other.count, other.mean - self.mean
-        self.m2 = self.m2 + other.m2 + delta**2 * (self.count * other.count / total)
-        self.mean, self.count = self.mean + delta * (other.count / total), total
-        return self
-
-    def standardise(self, x: np.ndarray) -> np.ndarray:
-        return (x - self.mean) / np.maximum(np.sqrt(self.m2 / max(self.count, 1)), 1e-8)
-
-
-def chunks(frames: np.ndarray, size: int = 512) -> list[np.ndarray]:
-    return [frames[k : k + size] for k in range(0, len(frames), size)]
-
-
-def to_input(frames: np.ndarray, device: str) -> torch.Tensor:
-    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1."""
-    return channels_first(torch.from_numpy(frames).to(device)).float() / 255
-
-
-def channels_first(x: torch.Tensor) -> torch.Tensor:
-    return x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
+# -------------------------------------------------------- the networks' layers (6.1, R18; S6.1-03)
 
 
 class BasicBlock(nn.Module):
     """The residual block of ResNet-18 (He et al. 2016)."""
 
-    def __init__(self, inputs: int, width: int, stride: int):
+    def __init__(self, inputs, width, stride=1):
         super().__init__()
         self.residual = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, stride, 1, bias=False), nn.BatchNorm2d(width), nn.ReLU(inplace=True),
-            nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width))
-        self.shortcut = nn.Sequential()
+            *convolution(inputs, width, 3, stride, 1),
+            nn.ReLU(inplace=True),
+            *convolution(width, width, 3, 1, 1),
+        )
+        self.shortcut = nn.Sequential()  # the identity
         if stride > 1:
-            self.shortcut = nn.Sequential(nn.Conv2d(inputs, width, 1, stride, bias=False), nn.BatchNorm2d(width))
+            self.shortcut = nn.Sequential(*convolution(inputs, width, 1, stride, 0))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return F.relu(self.residual(x) + self.shortcut(x), inplace=True)
 
 
-class SpatialMean(nn.Module):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return x.mean((2, 3))  # as AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA
+class ResNet18(nn.Module):
+    """17 convolutions and a linear layer (He et al. 2016): (B, C, H, W) -> (B, out)."""
+
+    def __init__(self, channels, out):
+        super().__init__()
+        self.layers = nn.Sequential(
+            *convolution(channels, 64, 7, 2, 3),
+            nn.ReLU(inplace=True),
+            nn.MaxPool2d(3, 2, padding=1),
+            BasicBlock(64, 64),
+            BasicBlock(64, 64),
+            BasicBlock(64, 128, stride=2),
+            BasicBlock(128, 128),
+            BasicBlock(128, 256, stride=2),
+            BasicBlock(256, 256),
+            BasicBlock(256, 512, stride=2),
+            BasicBlock(512, 512),
+        )
+        self.linear = nn.Linear(512, out)
+
+    def forward(self, x):
+        x = self.layers(x)  # (B, 512, h, w)
+        # As AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA.
+        return self.linear(x.mean((2, 3)))
 
 
-class Frugal(nn.Sequential):
-    """A Sequential that trains in less memory: it takes a batch in halves, the states s_1 and the states s_2, and has the
-    backward pass compute most activations anew, not kept (which moves BatchNorm's running statistics twice a batch)."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if not self.training:
-            return super().forward(x)
-        return torch.cat([checkpoint_sequential(self, 3, half, use_reentrant=False) for half in x.chunk(2)])
+def convolution(inputs, width, kernel, stride, padding):
+    """A convolution with batch normalisation, whose bias serves both."""
+    conv = nn.Conv2d(inputs, width, kernel, stride, padding, bias=False)
+    return [conv, nn.BatchNorm2d(width)]
 
 
-def resnet18(channels: int, out: int) -> nn.Module:
-    """17 convolutions and a linear layer: (B, C, H, W) -> (B, out)."""
-    layers = [nn.Conv2d(channels, 64, 7, 2, 3, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True), nn.MaxPool2d(3, 2, 1)]
-    for inputs, width in ((64, 64), (64, 128), (128, 256), (256, 512)):
-        layers += [BasicBlock(inputs, width, width // inputs), BasicBlock(width, width, 1)]
-    return Frugal(*layers, SpatialMean(), nn.Linear(512, out))
+# Width, kernel, stride, padding: of Burda et al., and the maze's.
+NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))
+SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))
 
 
-SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))  # width, kernel, stride, padding
-NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))  # Mnih et al. 2015, which Burda et al. 2019 use
+def convolutions(layers, shape, out, batch_norm):
+    """A stack of convolutions and a linear layer, for frames of a shape: (B, C, H, W) -> (B,
+    out)."""
+    modules = []
+    channels = channels_of(shape)
+    for width, kernel, stride, padding in layers:
+        modules.append(nn.Conv2d(channels, width, kernel, stride, padding))
+        if batch_norm:
+            modules.append(nn.BatchNorm2d(width))
+        modules.append(nn.ReLU(inplace=True))
+        channels = width
+    modules.append(nn.Flatten())
+    try:
+        sizes = nn.Sequential(*modules).eval()(torch.zeros(1, channels_of(shape), *shape[:2])).shape
+    except RuntimeError:
+        raise InputError(
+            f"frames of {shape[0]} x {shape[1]} pixels are too small for the network: "
+            "make them larger, or set small_networks"
+        ) from None
+    return nn.Sequential(*modules, nn.Linear(sizes[1], out))
 
 
-def convolutions(shape: tuple, out: int, layers: tuple, norm: bool) -> nn.Module:
-    """A stack of convolutions and a linear layer, for frames of this shape: (B, C, H, W) -> (B, out)."""
-    modules, (height, width), channels = [], shape[:2], channels_of(shape)
-    for planes, kernel, stride, pad in layers:
-        modules += [nn.Conv2d(channels, planes, kernel, stride, pad)] + [nn.BatchNorm2d(planes)] * norm + [nn.ReLU(inplace=True)]
-        height, width = ((side + 2 * pad - kernel) // stride + 1 for side in (height, width))
-        channels = planes
-    if min(height, width) < 1:
-        raise InputError(f"frames of {shape[0]} x {shape[1]} are too small for the network: make them larger, or set encoder and "
-                         "rnd_encoder to small")
-    return nn.Sequential(*modules, nn.Flatten(), nn.Linear(channels * height * width, out))
+def dense(inputs, outputs):
+    """A layer of R's head (R20)."""
+    return [nn.BatchNorm1d(inputs), nn.ReLU(), nn.Linear(inputs, outputs)]
 
 
-def channels_of(shape: tuple) -> int:
+def channels_of(shape):
     return shape[2] if len(shape) == 3 else 1
 
 
-def initialise(module: nn.Module, seed: int) -> nn.Module:
+def initialise(network, seed):
     """He's initialisation, and biases of 0, from a generator of our own."""
     generator = torch.Generator().manual_seed(seed)
-    for layer in module.modules():
+    for layer in network.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
-    return module
 
 
-def descend(optimiser: torch.optim.Optimizer, loss: torch.Tensor, what: str, clip: float | None = None) -> float:
-    """One step of the optimiser down the loss, its gradient clipped at the norm `clip`. Returns the loss before it."""
+def to_input(frames, device):
+    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1 (S6.1-02)."""
+    return channels_first(torch.from_numpy(frames).to(device)).float() / 255
+
+
+def channels_first(x):
+    """(B, H, W) or (B, H, W, C) -> (B, C, H, W)."""
+    return x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
+
+
+def in_parts(frames, size=512):
+    """Frames in parts that fit into memory at once."""
+    return [frames[k : k + size] for k in range(0, len(frames), size)]
+
+
+def batches(items, size):
+    """Shuffled items in batches of nearly equal sizes, at most `size`."""
+    count = math.ceil(len(items) / size)
+    return [items[k::count] for k in range(count)]
+
+
+def descend(optimiser, loss, name, max_norm=math.inf):
+    """One step down the loss, its gradient clipped. InputError: the loss is infinite or no
+    number."""
     if not math.isfinite(loss.item()):
-        raise FloatingPointError(f"the loss of {what} is {loss.item()}: start again with a lower learning rate")
+        raise InputError(f"the loss of {name} is {loss.item()}: give a lower learning rate")
     optimiser.zero_grad()
     loss.backward()
-    if clip is not None:
-        nn.utils.clip_grad_norm_([w for group in optimiser.param_groups for w in group["params"]], clip)
+    weights = [weight for group in optimiser.param_groups for weight in group["params"]]
+    nn.utils.clip_grad_norm_(weights, max_norm)
     optimiser.step()
-    return loss.item()
 
 
-# ######################################################################################################################
-# Nothing below this line belongs to the algorithm: the methods compared, the run folder, its figures, the command line.
-# ######################################################################################################################
+def check_budget(algorithm):
+    budget = algorithm.config.steps
+    if algorithm.steps >= budget:
+        raise InputError(f"the budget of {budget:,} steps is spent: give more steps")
 
-# ------------------------------------------------------------------- the methods compared (6.2; S6.2-03, S6.2-04, R2, R27)
+
+def progress_metrics(algorithm):
+    """Where a run stands, and %Cov: visited units of all, where these are known (5; S5-03)."""
+    full = getattr(algorithm.env, "full_coverage", None)
+    units = len(algorithm.discovered)
+    return {
+        "iteration": algorithm.iteration,
+        "phase": "pretrain" if algorithm.pretraining else "explore",
+        "steps": algorithm.steps,
+        "units": units,
+        "coverage": min(1.0, units / full) if full else None,  # a full count may be an estimate
+    }
+
+
+def statistics_state(statistics):
+    return {
+        "mean": torch.as_tensor(statistics.mean),
+        "var": torch.as_tensor(statistics.var),
+        "count": float(statistics.count),
+    }
+
+
+def load_statistics(statistics, state):
+    statistics.mean = state["mean"].numpy()
+    statistics.var = state["var"].numpy()
+    statistics.count = state["count"]
+
+
+def progress(items=None, what="", total=None):
+    """A bar over a long loop; silent where the output is no terminal."""
+    return tqdm(items, desc=what, total=total, leave=False, disable=None)
+
+
+# ##################################################################################################
+# Nothing below this line belongs to the algorithm.
+# ##################################################################################################
+
+# ------------------------------------- the methods compared (6.2; S6.2-03, S6.2-04; R2, R25, R27)
 
 
 class Baseline:
-    """What the compared methods share with RbExplore: one step counter, one coverage (R2, R25), seeds by purpose, and the
-    interface that the run folder uses. A subclass has advance(): spend the steps of one iteration, and learn from them."""
+    """What the compared methods share with RbExplore: one count of steps, one coverage, and the
+    interface that a run folder uses. A subclass has advance(rng): act and learn for one iteration,
+    and return metrics."""
 
-    run, seed, rng, phase = RbExplore.run, RbExplore.seed, RbExplore.rng, "explore"
-    parts, moments = (), ()  # networks and optimisers, and statistics, which a checkpoint keeps
+    pretraining = False
 
-    def __init__(self, env_fn: Callable, config: Config):
-        self.config, self.env, self.tell = config, env_fn(), lambda event, **data: None
-        check_contract(self.env)
-        self.s_init = self.env.reset(seed=config.seed)[0].copy()
-        self.snap_init, unit = self.env.snapshot(), unit_key(self.env.unit())
-        self.iteration = self.steps = self.exploration_steps = 0
-        self.discovered: dict[tuple, int] = {} if unit is None else {unit: 0}
+    def __init__(self, env_fn, config):
+        self.config = config
+        self.env = env_fn()
+        check_contract(self.env, config.seed)
+        self.s_init = self.reset()
+        unit = unit_key(self.env.unit())
+        self.iteration = 0
+        self.steps = 0
+        self.discovered = {} if unit is None else {unit: 0}
 
-    def iterate(self) -> dict:
-        """One iteration. Returns its metrics."""
+    def iterate(self) -> Iteration:
+        """One iteration."""
         check_budget(self)
         self.iteration += 1
-        self.row = {"iteration": self.iteration, "phase": self.phase}
-        self.tell("iteration", **self.row)
-        self.advance()
-        self.row |= counts(self)
-        self.tell("row", row=self.row)
-        return self.row
+        metrics = self.advance(np.random.default_rng([self.config.seed, self.iteration]))
+        return Iteration({**progress_metrics(self), **metrics})
 
-    def step(self, action: int) -> tuple[np.ndarray, bool, bool]:
-        """One step of the environment, counted and covered as RbExplore's: the frame, terminated, truncated."""
-        frame, _, terminated, truncated, _ = self.env.step(action + int(self.env.action_space.start))
-        self.steps, self.exploration_steps, unit = self.steps + 1, self.exploration_steps + 1, self.env.unit()
+    def reset(self):
+        """Back to the start; gives its frame."""
+        return np.array(self.env.reset(seed=self.config.seed)[0])
+
+    def step(self, action):
+        """One step, counted and covered as RbExplore's. Returns the frame, and whether the episode
+        has ended."""
+        action += int(self.env.action_space.start)
+        frame, _, terminated, truncated, _ = self.env.step(action)
+        self.steps += 1
+        unit = unit_key(self.env.unit())
         if unit is not None:
-            self.discovered.setdefault(unit_key(unit), self.steps)
-        return frame, terminated, truncated
+            self.discovered.setdefault(unit, self.steps)
+        return np.array(frame), bool(terminated or truncated)
+
+    def state_dict(self):
+        return {
+            "iteration": self.iteration,
+            "steps": self.steps,
+            "discovered": self.discovered,
+        }
+
+    def load_state_dict(self, state):
+        self.iteration = state["iteration"]
+        self.steps = state["steps"]
+        self.discovered = state["discovered"]
 
 
 class Random(Baseline):
-    """Uniform over the actions, always from the start, M episodes an iteration: nothing is stored or rolled back to."""
+    """Uniform over the actions, always from the start, M episodes an iteration: nothing is
+    stored."""
 
-    def advance(self) -> None:
-        rng = self.rng("explore")
+    def advance(self, rng):
         for _ in range(self.config.M):
-            self.env.reset(seed=self.config.seed)
-            for _ in range(min(self.config.trajectory_steps, self.config.steps - self.steps)):
-                if any(self.step(int(rng.integers(self.env.action_space.n)))[1:]):
+            self.reset()
+            length = min(self.config.trajectory_steps, self.config.steps - self.steps)
+            for _ in range(length):
+                _, ended = self.step(int(rng.integers(self.env.action_space.n)))
+                if ended:
                     break
+        return {}
 
 
-@dataclass(frozen=True)
-class PPOConfig:
-    """PPO's settings, the same for RND and ICM: Burda et al. 2019 (table 5, or their code), and Pathak et al. 2017 (R27)."""
+class RNDBonus(RND):
+    """The bonus of Burda et al. 2019: the error of RND on the state arrived at."""
 
-    actors: int = option(128, "environments: snapshots that one environment takes turns at (Burda)", 1)
-    rollout_steps: int = option(128, "steps of an actor an iteration (Burda)", 1)
-    episode_steps: int = option(4500, "longest episode, steps: 18,000 frames (Burda)", 1)
-    stack: int = option(4, "latest frames that policy and value see (Burda)", 1)
-    gamma: float = option(0.99, "discount of the intrinsic reward (Burda)", 0, 1)
-    gae_lambda: float = option(0.95, "lambda of GAE (Burda)", 0, 1)
-    episodic: bool = option(False, "returns end with their episode; intrinsic ones do not (Burda)")
-    learning_rate: float = option(1e-4, "Adam's, for PPO and ICM; RND has rnd_learning_rate (Burda)", 0)
-    passes: int = option(4, "passes over a rollout (Burda: epochs)", 1)
-    minibatches: int = option(4, "minibatches a pass (Burda)", 1)
-    clip: float = option(0.1, "PPO's bound on the change of a probability (Burda)", 0)
-    entropy: float = option(0.001, "weight of the entropy (Burda)", 0)
-    value_weight: float = option(0.5, "weight of the value's squared error (Burda's code)", 0)
-    standardise: bool = option(False, "advantages have mean 0 and deviation 1 in a minibatch; not so in Burda's code")
-    bonus_share: float = option(0.25, "share of the experience that trains the bonus: 32 actors' of 128 (Burda)", 0, 1)
-    hidden: int = option(448, "width of the layer before policy and value, and of ICM's models (Burda's code)", 1)
-    icm_beta: float = option(0.2, "weight of ICM's forward loss; 1 - it of the inverse loss (Pathak)", 0, 1)
-    __post_init__ = check_fields
+    def bonus(self, before, actions, after):
+        """Frames (T, H, W), actions (T,), frames (T, H, W) -> (T,). The statistics of the pixels
+        come first, as there is no error without them."""
+        self.pixels.update(after)
+        return self.errors(after)
 
-
-# The maze's: 8 actors, so that 100,000 steps make 97 updates and not 6, each of which then has to count; one frame shows all
-# that four would; no state of level 1 is more than 86 steps from the start.
-PPO_CONFIGS = {"paper": PPOConfig(), "maze": PPOConfig(actors=8, episode_steps=150, stack=1, learning_rate=1e-3, standardise=True,
-                                                       bonus_share=1.0, hidden=128)}
-
-
-class RNDBonus:
-    """Burda et al. 2019, 2.2 and 2.4: the error of RND, the one of RbExplore's novelty, on the state arrived at."""
-
-    def __init__(self, config: Config, ppo: PPOConfig, shape: tuple, actions: int, device: str):
-        self.rnd = RND(config, shape, device)
-        self.parts, self.moments = (self.rnd.target, self.rnd.predictor, self.rnd.optimiser), (self.rnd.pixels,)
-
-    @torch.no_grad()
-    def reward(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Frames (B, H, W), actions (B,), frames (B, H, W) -> (B,). The pixels' statistics come first, as there is no error
-        without them: the first rollout, of a policy still uniform, is Burda et al.'s random agent."""
-        for part in chunks(after):
-            self.rnd.pixels.join(Moments(part))
-        return np.concatenate([self.rnd.distance(part).cpu().numpy() for part in chunks(after)])
-
-    def update(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> dict[str, float]:
-        return {"rnd_loss": float(self.rnd.update(after).mean())}
+    def learn(self, before, actions, after):
+        """One step on a batch. Returns the losses by name."""
+        return {"rnd_loss": self.update(after)}
 
 
 class ICM(nn.Module):
-    """Pathak et al. 2017: the error of a forward model, in the features of an encoder that learns by the inverse model
-    alone. Their frames, layers and width are RND's and PPO's here, so that nothing differs but the bonus."""
+    """The bonus of Pathak et al. 2017: the error of a forward model, in the features of an encoder
+    that learns by the inverse model alone. Its layers are RND's."""
 
-    def __init__(self, config: Config, ppo: PPOConfig, shape: tuple, actions: int, device: str):
+    BETA = 0.2  # the weight of the forward loss (Pathak)
+
+    def __init__(self, config, shape, actions, device):
         super().__init__()
-        d, w, self.actions, self.beta, self.device = config.rnd_features, ppo.hidden, actions, ppo.icm_beta, device
-        with torch.random.fork_rng(devices=[]):
-            self.encoder = convolutions(shape, d, SMALL if config.rnd_encoder == "small" else NATURE, norm=False)
-            self.inverse_model = nn.Sequential(nn.Linear(2 * d, w), nn.ReLU(), nn.Linear(w, actions))
-            self.forward_model = nn.Sequential(nn.Linear(d + actions, w), nn.ReLU(), nn.Linear(w, d))
-        self.optimiser = torch.optim.Adam(initialise(self, config.seed + 3).to(device).parameters(), lr=ppo.learning_rate)
-        self.parts, self.moments = (self, self.optimiser), ()
+        d = config.embedding
+        layers = SMALL if config.small_networks else NATURE
+        self.actions = actions
+        self.device = device
+        self.encoder = convolutions(layers, shape, d, batch_norm=False)
+        self.inverse_model = perceptron(2 * d, config.head_width, actions)
+        self.forward_model = perceptron(d + actions, config.head_width, d)
+        initialise(self, config.seed + 3)
+        self.to(device)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate)
 
-    def losses(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """Frames (B, H, W), actions (B,), frames (B, H, W) -> inverse and forward losses (B,), (B,): equations 3 and 5."""
-        phi, phi_next = self.encoder(to_input(np.concatenate([before, after]), self.device)).chunk(2)  # (B, d) each
+    def losses(self, before, actions, after):
+        """Frames (B, H, W), actions (B,), frames (B, H, W) -> inverse and forward losses, (B,)
+        each: their equations 3 and 5."""
+        frames = to_input(np.concatenate([before, after]), self.device)
+        phi, phi_next = self.encoder(frames).chunk(2)  # (B, d) each
         a = torch.from_numpy(actions).to(self.device)
-        inverse = F.cross_entropy(self.inverse_model(torch.cat([phi, phi_next], 1)), a, reduction="none")
-        guess = self.forward_model(torch.cat([phi.detach(), F.one_hot(a, self.actions)], 1))  # (B, d)
-        return inverse, (guess - phi_next.detach()).square().sum(1) / 2
+        a_guess = self.inverse_model(torch.cat([phi, phi_next], dim=1))
+        inverse = F.cross_entropy(a_guess, a, reduction="none")
+        one_hot = F.one_hot(a, self.actions)
+        phi_guess = self.forward_model(torch.cat([phi.detach(), one_hot], dim=1))
+        forward = (phi_guess - phi_next.detach()).square().sum(1) / 2
+        return inverse, forward
 
     @torch.no_grad()
-    def reward(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Equation 6, (B,), without its factor eta: PPO divides the reward by its own scale in any case."""
-        parts = zip(chunks(before), chunks(actions), chunks(after), strict=True)
+    def bonus(self, before, actions, after):
+        """Their equation 6, (T,), without its factor eta: PPO divides by the bonus's own scale."""
+        parts = zip(in_parts(before), in_parts(actions), in_parts(after), strict=True)
         return np.concatenate([self.losses(*part)[1].cpu().numpy() for part in parts])
 
-    def update(self, before: np.ndarray, actions: np.ndarray, after: np.ndarray) -> dict[str, float]:
-        """A step on equation 7, whose policy term is PPO's own."""
-        inverse, forward = (loss.mean() for loss in self.losses(before, actions, after))
-        descend(self.optimiser, (1 - self.beta) * inverse + self.beta * forward, "ICM")
-        return {"inverse_loss": inverse.item(), "forward_loss": forward.item()}
+    def learn(self, before, actions, after):
+        """One step on their equation 7, whose policy term is PPO's own. Returns the losses by
+        name."""
+        inverse, forward = self.losses(before, actions, after)
+        loss = (1 - self.BETA) * inverse.mean() + self.BETA * forward.mean()
+        descend(self.optimiser, loss, "ICM")
+        return {"inverse_loss": inverse.mean().item(), "forward_loss": forward.mean().item()}
+
+    def get_extra_state(self):
+        return self.optimiser.state_dict()
+
+    def set_extra_state(self, state):
+        self.optimiser.load_state_dict(state)
 
 
-def gae(rewards, values, last, ended, at_end, gamma: float, lam: float, episodic: bool) -> np.ndarray:
-    """Generalised advantage estimation (Schulman et al. 2016, equation 16). All (T, K) but `last`, (K,): values of the states
-    acted in, and of those after the rollout. An episodic return ends with its episode, with `at_end`: 0 after a death, the
-    value of the last state where only time ran out. Others go on, with the value of the next episode's first state."""
-    following, cut = np.concatenate([values[1:], last[None]]), ended & episodic
-    advantages, tail = rewards + gamma * np.where(cut, at_end, following) - values, 0.0
+def perceptron(inputs, width, outputs):
+    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs))
+
+
+def advantages_of(rewards, values, last_value, gamma, gae_lambda):
+    """Generalised advantage estimation (Schulman et al. 2016, equation 16): (T,) from rewards (T,),
+    values (T,) of the states acted in, and the value of the state after. Returns go on beyond the
+    end of an episode, as intrinsic ones do (Burda)."""
+    following = np.append(values[1:], last_value)
+    delta = rewards + gamma * following - values
+    advantages = np.zeros(len(rewards))
+    advantage = 0.0
     for t in reversed(range(len(rewards))):
-        advantages[t] = tail = advantages[t] + gamma * lam * ~cut[t] * tail
+        advantage = delta[t] + gamma * gae_lambda * advantage
+        advantages[t] = advantage
     return advantages
 
 
 class PPO(Baseline):
-    """Proximal policy optimisation (Schulman et al. 2017) of a bonus, RNDBonus or ICM, alone: the environment's rewards are
-    ignored. The actors are snapshots of one environment, which plays them in turn: emulators allow no second one."""
+    """Proximal policy optimisation (Schulman et al. 2017) of a bonus alone, RND's or ICM's, by the
+    settings of Burda et al. 2019, table 5 (R27), but for one actor, whose rollout is as long as
+    that of their 128, and a policy that sees what RbExplore sees: one frame (5)."""
 
-    def __init__(self, env_fn: Callable, config: Config, device: str, ppo: PPOConfig, bonus: Callable):
+    GAMMA = 0.99  # discount of the intrinsic reward
+    GAE_LAMBDA = 0.95
+    PASSES = 4  # over a rollout
+    MINIBATCHES = 4  # a pass
+    CLIP = 0.1  # bound on the change of a probability
+    ENTROPY = 0.001  # weight of the entropy
+    VALUE = 0.5  # weight of the value's squared error (Burda's code)
+
+    def __init__(self, env_fn, config, method, device):
         super().__init__(env_fn, config)
-        shape, self.n, self.ppo, self.device = self.s_init.shape, int(self.env.action_space.n), ppo, device
-        self.channels, layers = channels_of(shape), SMALL if config.rnd_encoder == "small" else NATURE
+        self.device = device
+        self.actions = int(self.env.action_space.n)
+        shape = self.s_init.shape
+        width = config.head_width
+        layers = SMALL if config.small_networks else NATURE
         with torch.random.fork_rng(devices=[]):
-            self.net = nn.Sequential(convolutions((*shape[:2], self.channels * ppo.stack), ppo.hidden, layers, norm=False),
-                                     nn.ReLU(), nn.Linear(ppo.hidden, self.n + 1))
-        initialise(self.net, config.seed + 4).to(device)
-        self.net[-1].weight.data *= 0.01  # the first policy is uniform, the first values are 0
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=ppo.learning_rate)
-        self.bonus = bonus(config, ppo, shape, self.n, device)
-        self.sums, self.returns = np.zeros(ppo.actors), Moments()  # discounted sums of the bonus; their moments
-        self.parts, self.moments = (self.net, self.optimiser, *self.bonus.parts), (self.returns, *self.bonus.moments)
-        self.snapshots, self.ages = [self.snap_init] * ppo.actors, np.zeros(ppo.actors, np.int64)
-        self.seen = np.stack([self.first(self.s_init)] * ppo.actors)  # (K, H, W, C * stack)
+            encoder = convolutions(layers, shape, width, batch_norm=False)
+            head = nn.Linear(width, self.actions + 1)  # the logits of the policy, and the value
+            self.network = nn.Sequential(encoder, nn.ReLU(), head)
+            if method == "rnd":
+                self.curiosity = RNDBonus(config, shape, device)
+            else:
+                self.curiosity = ICM(config, shape, self.actions, device)
+        initialise(self.network, config.seed + 4)
+        head.weight.data *= 0.01  # so that the first policy is uniform and the first values are 0
+        self.network.to(device)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
+        self.discounted_sum = 0.0  # of the bonus so far
+        self.discounted_sums = RunningMeanStd()
+        self.frame = self.s_init
+        self.age = 0  # steps of this episode
 
-    def first(self, frame: np.ndarray) -> np.ndarray:
-        """What is seen at the start of an episode: its frame, (H, W) or (H, W, C), `stack` times, (H, W, C * stack)."""
-        return np.tile(frame.reshape(*frame.shape[:2], -1), self.ppo.stack)
-
-    def act(self, seen: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, H, W, C * stack) -> log-probabilities (B, A), values (B,)."""
-        out = self.net(to_input(seen, self.device))
-        return F.log_softmax(out[:, :-1], 1), out[:, -1]
+    def policy(self, frames):
+        """Frames (B, H, W) -> log-probabilities (B, actions), values (B,)."""
+        out = self.network(to_input(frames, self.device))
+        return F.log_softmax(out[:, :-1], dim=1), out[:, -1]
 
     @torch.no_grad()
-    def one(self, k: int) -> tuple[np.ndarray, float]:
-        """Log-probabilities (A,) and value of what actor k sees."""
-        logp, value = self.act(self.seen[k : k + 1])
-        return logp[0].cpu().numpy(), value.item()
+    def act(self, frame, rng):
+        """A sample of the policy: the action, its log-probability, and the value of the state."""
+        log_p, value = self.policy(frame[None])
+        log_p = log_p[0].cpu().numpy()
+        action = int(np.argmax(log_p + rng.gumbel(size=self.actions)))
+        return action, log_p[action], value.item()
 
-    def advance(self) -> None:
+    def advance(self, rng):
         """A rollout, and several passes over it, of PPO and of the bonus."""
-        p, rng, (seen, actions, logp, after, values, *ends) = self.ppo, self.rng("novelty"), self.rollout()
-        size, before = actions.size, seen[..., -self.channels :].reshape(after.shape)
-        transitions = [x.reshape(size, *x.shape[2:]) for x in (before, actions, after)]
-        bonus = self.bonus.reward(*transitions)
-        advantages = gae(self.scaled(bonus.reshape(actions.shape)), values, *ends, p.gamma, p.gae_lambda, p.episodic)
-        experience = [x.reshape(size, *x.shape[2:]) for x in (seen, actions, logp, advantages, advantages + values)]
-        losses: dict[str, list] = {"bonus": [bonus.mean()]}
-        for _ in range(p.passes):
-            for batch in np.array_split(rng.permutation(size), min(p.minibatches, size)):
-                new = self.update(*(x[batch] for x in experience))
-                kept = batch[rng.random(len(batch)) < p.bonus_share]
-                if len(kept):
-                    new |= self.bonus.update(*(x[kept] for x in transitions))
-                for name, loss in new.items():
-                    losses.setdefault(name, []).append(loss)
-        self.row |= {name: float(np.mean(values)) for name, values in losses.items()}
+        before, actions, after, log_p, values, last_value = self.rollout(rng)
+        bonus = self.curiosity.bonus(before, actions, after)
+        rewards = self.scaled(bonus)
+        advantages = advantages_of(rewards, values, last_value, self.GAMMA, self.GAE_LAMBDA)
+        returns = advantages + values
+        size = math.ceil(len(actions) / self.MINIBATCHES)
+        losses = []
+        for _ in range(self.PASSES):
+            for k in batches(rng.permutation(len(actions)), size):
+                ppo = self.update(before[k], actions[k], log_p[k], advantages[k], returns[k])
+                losses.append(ppo | self.curiosity.learn(before[k], actions[k], after[k]))
+        means = {name: float(np.mean([row[name] for row in losses])) for name in losses[0]}
+        return {"bonus": float(bonus.mean()), **means}
 
-    def rollout(self) -> tuple:
-        """T steps of each of K actors, and none beyond the budget (S6.2-04)."""
-        p, rng, left = self.ppo, self.rng("explore"), self.config.steps - self.steps
-        T, K = max(1, min(p.rollout_steps, left // p.actors)), min(p.actors, left)
-        seen, after = np.empty((T, K, *self.seen.shape[1:]), np.uint8), np.empty((T, K, *self.s_init.shape), np.uint8)
-        actions, ended, last = np.empty((T, K), np.int64), np.zeros((T, K), bool), np.empty(K)
-        logp, values, at_end = np.zeros((3, T, K))
-        for k in range(K):
-            self.env.restore(self.snapshots[k])
-            for t in range(T):
-                policy, values[t, k] = self.one(k)
-                action = int((policy + rng.gumbel(size=self.n)).argmax())  # a sample of the policy
-                seen[t, k], actions[t, k], logp[t, k] = self.seen[k], action, policy[action]
-                after[t, k], terminated, truncated = self.step(action)
-                self.ages[k] += 1
-                self.seen[k] = np.roll(self.seen[k], -self.channels, -1)
-                self.seen[k, ..., -self.channels :] = after[t, k].reshape(*self.seen.shape[1:3], -1)
-                ended[t, k] = terminated or truncated or self.ages[k] >= p.episode_steps
-                if ended[t, k]:
-                    at_end[t, k] = 0 if terminated else self.one(k)[1]
-                    self.seen[k], self.ages[k] = self.first(self.env.reset(seed=self.config.seed)[0]), 0
-            self.snapshots[k], last[k] = self.env.snapshot(), self.one(k)[1]
-            self.tell("progress", step="explore", done=k + 1, total=K)
-        return seen, actions, logp, after, values, last, ended, at_end
+    def rollout(self, rng):
+        """Frames (T, H, W), actions (T,), frames arrived at (T, H, W), log-probabilities (T,),
+        values (T,), and the value of the state after. T ends with the budget (S6.2-04)."""
+        T = min(self.config.rollout_steps, self.config.steps - self.steps)
+        before = np.empty((T, *self.frame.shape), np.uint8)
+        after = np.empty_like(before)
+        actions = np.empty(T, np.int64)
+        log_p = np.empty(T, np.float32)
+        values = np.empty(T, np.float32)
+        for t in progress(range(T), "rollout"):
+            before[t] = self.frame
+            actions[t], log_p[t], values[t] = self.act(self.frame, rng)
+            self.frame, ended = self.step(int(actions[t]))
+            after[t] = self.frame
+            self.age += 1
+            if ended or self.age >= self.config.episode_steps:
+                self.frame = self.reset()
+                self.age = 0
+        _, _, last_value = self.act(self.frame, rng)
+        return before, actions, after, log_p, values, last_value
 
-    def scaled(self, bonus: np.ndarray) -> np.ndarray:
-        """The bonus (T, K) over the standard deviation of its discounted sums so far, along the time of each actor (Burda et al.
-        2019, 2.4, and their code)."""
-        sums, K = np.empty(bonus.shape), bonus.shape[1]
-        for t, now in enumerate(bonus):
-            sums[t] = self.sums[:K] = self.ppo.gamma * self.sums[:K] + now
-        self.returns.join(Moments(sums.ravel()))
-        return bonus / max(math.sqrt(self.returns.m2 / self.returns.count), 1e-8)
+    def scaled(self, bonus):
+        """The bonus (T,) over the standard deviation of its discounted sums so far (Burda, 2.4)."""
+        sums = np.empty(len(bonus))
+        for t in range(len(bonus)):
+            self.discounted_sum = self.GAMMA * self.discounted_sum + float(bonus[t])
+            sums[t] = self.discounted_sum
+        self.discounted_sums.update(sums)
+        return bonus / np.sqrt(self.discounted_sums.var + 1e-8)
 
-    def update(self, seen, actions, logp, advantages, targets) -> dict[str, float]:
-        """A step on B states: the clipped objective, the value's squared error and the entropy (equations 7 and 9)."""
-        p, (new, values) = self.ppo, self.act(seen)
-        logp, advantages, targets = (torch.from_numpy(x).to(values) for x in (logp, advantages, targets))  # (B,)
-        if p.standardise:
-            advantages = (advantages - advantages.mean()) / (advantages.std(correction=0) + 1e-8)
-        ratio = (new[range(len(actions)), actions] - logp).exp()
-        gain = torch.min(ratio * advantages, ratio.clamp(1 - p.clip, 1 + p.clip) * advantages).mean()
-        value_loss, entropy = (values - targets).square().mean(), -(new.exp() * new).sum(1).mean()
-        descend(self.optimiser, p.value_weight * value_loss - gain - p.entropy * entropy, "PPO")
+    def update(self, frames, actions, old_log_p, advantages, returns):
+        """One step on B states: the clipped objective, the value's squared error and the entropy
+        (Schulman et al. 2017, equations 7 and 9). Returns the losses by name."""
+        log_p, values = self.policy(frames)
+        old_log_p = torch.from_numpy(old_log_p).to(values)  # (B,)
+        advantages = torch.from_numpy(advantages).to(values)
+        returns = torch.from_numpy(returns).to(values)
+        ratio = (log_p[range(len(actions)), actions] - old_log_p).exp()
+        clipped = ratio.clamp(1 - self.CLIP, 1 + self.CLIP)
+        gain = torch.min(ratio * advantages, clipped * advantages).mean()
+        value_loss = (values - returns).square().mean()
+        entropy = -(log_p.exp() * log_p).sum(1).mean()
+        loss = self.VALUE * value_loss - gain - self.ENTROPY * entropy
+        descend(self.optimiser, loss, "PPO")
         return {"value_loss": value_loss.item(), "entropy": entropy.item()}
+
+    def state_dict(self):
+        return {
+            **super().state_dict(),
+            "network": self.network.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "curiosity": self.curiosity.state_dict(),
+            "discounted_sum": self.discounted_sum,
+            "discounted_sums": statistics_state(self.discounted_sums),
+            "frame": torch.from_numpy(self.frame),
+            "snapshot": self.env.snapshot(),
+            "age": self.age,
+        }
+
+    def load_state_dict(self, state):
+        super().load_state_dict(state)
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.curiosity.load_state_dict(state["curiosity"])
+        self.discounted_sum = state["discounted_sum"]
+        load_statistics(self.discounted_sums, state["discounted_sums"])
+        self.frame = state["frame"].numpy()
+        roll_back(self.env, State(self.frame, state["snapshot"]))
+        self.age = state["age"]
 
 
 class Cells(nn.Module):
-    """Cells in R's place: 1 for states of one cell, else 0. embed: frames (T, H, W) uint8 -> cells (T, d)."""
+    """Go-Explore's cells without domain knowledge (Ecoffet et al. 2019) in the place of R: two
+    frames are similar if they are equal in 11 x 8 pixels of 8 grey levels. Nothing is learned."""
 
-    def __init__(self, embed: Callable):
-        super().__init__()
-        self.embed, self.optimiser = embed, nn.Identity()  # nothing is trained: both have an empty state_dict
-        self.fit = lambda *unused: None
+    def embed(self, frames):
+        """Frames (T, H, W) uint8 -> cells (T, 88)."""
+        cells = []
+        for part in in_parts(frames):
+            gray = to_input(part, "cpu").mean(1, keepdim=True)  # (B, 1, H, W)
+            small = F.interpolate(gray, (8, 11), mode="area").flatten(1)
+            cells.append((small * 8).clamp(max=7).byte())
+        return torch.cat(cells)
 
-    def probability(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-        """Cells (K, d) and (K, d) or (d,) -> (K,)."""
-        return (first == second).all(1).double()
+    def score(self, e_1, e_2):
+        """Cells (K, 88), and (K, 88) or (88,) -> (K,)."""
+        return (e_1 == e_2).all(1).double().numpy()
 
-    def score(self, first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-        return self.probability(first, second).numpy()
+    def rates(self, pairs, rng):
+        return None, None
 
-
-def coarse(frames: np.ndarray) -> torch.Tensor:
-    """Cells without domain knowledge (Ecoffet et al. 2019): gray, 11 x 8 areas, 8 levels: (T, H, W) -> (T, 88) uint8."""
-    areas = [F.interpolate(to_input(part, "cpu").mean(1, keepdim=True), (8, 11), mode="area") for part in chunks(frames)]
-    return (torch.cat(areas).flatten(1) * 8).clamp(max=7).byte()
-
-
-class ExactMaze(Maze):
-    """The maze with its whole state, the snapshot, over the first pixels of each frame."""
-
-    def _frame(self) -> np.ndarray:
-        frame, state = super()._frame().copy(), np.frombuffer(self.snapshot(), np.uint8)
-        frame[0, : len(state)] = state
-        return frame
+    def fit(self, pairs, rng):
+        return None
 
 
-def exact(frames: np.ndarray) -> torch.Tensor:
-    """Exact states as cells: (T, H, W) -> (T, W) uint8, the first row of ExactMaze's frames."""
-    return torch.from_numpy(frames[:, 0].copy())
+METHODS = ("rbexplore", "rnd", "icm", "random", "cells")
 
 
-METHODS = ("rbexplore", "rnd", "icm", "random", "cells", "oracle")
-
-
-def config_of(method: str, config: Config, **given) -> Config:
-    """The configuration with the given values, less the steps that serve a learned R alone: pretraining, additional ones."""
-    return replace(config, **given | ({} if method == "rbexplore" else {"pretrain_steps": 0, "L": 0}))
-
-
-def make_method(method: str, env_fn: Callable, config: Config, device: str = "cpu", executor=None, ppo: PPOConfig | None = None):
-    """RbExplore, or a method with its interface. Raises InputError for the oracle of anything but the maze."""
-    config = config_of(method, config)
-    if method in ("rnd", "icm"):
-        return PPO(env_fn, config, device, ppo or PPOConfig(), RNDBonus if method == "rnd" else ICM)
+def make_method(method, env_fn, config, device="cpu", executor=None):
+    """RbExplore, or a method with its interface."""
     if method == "random":
         return Random(env_fn, config)
-    if method == "oracle":
-        maze = env_fn()
-        if not isinstance(maze, Maze):
-            raise InputError("--method oracle knows the exact states of the maze alone: give --env maze, or another method")
-        env_fn = functools.partial(ExactMaze, maze.level, maze.frame_size)
-    a = RbExplore(env_fn, config, device, executor)
-    if method in ("cells", "oracle"):
-        a.similarity = Cells(exact if method == "oracle" else coarse)
-    return a
+    if method in ("rnd", "icm"):
+        return PPO(env_fn, config, method, device)
+    algorithm = RbExplore(env_fn, config, device, executor)
+    if method == "cells":
+        algorithm.similarity = Cells()
+    return algorithm
 
 
-METRICS = ("iteration", "phase", "steps", "exploration_steps", "coverage", "units", "clusters", "added", "merged",
-           "theta_sim", "r_loss", "r_accuracy", "r_true_positive", "r_true_negative", "novel_share", "additional",
-           "rnd_loss", "bonus", "inverse_loss", "forward_loss", "value_loss", "entropy", "memory_mb", "seconds")
-
-# --------------------------------------------------------------------------------------- the state of a run, as plain data
+# ----------------------------------------------------------------------------- the run folder
 
 
-def kept(a: RbExplore | Baseline) -> tuple[tuple, tuple]:
-    """The networks and optimisers of a method, and its statistics."""
-    if isinstance(a, Baseline):
-        return a.parts, a.moments
-    r, rnd = a.similarity, a.novelty
-    return (r, r.optimiser, rnd.target, rnd.predictor, rnd.optimiser), (rnd.pixels, *rnd.errors)
+class Run:
+    """A run folder: config.json, metrics.csv, checkpoint.pt, trace.jsonl and the figures; and what
+    one sees meanwhile. It has one owner: InputError where another process works in it.
+
+    settings: what makes the run, for config.json; by default the configuration alone."""
+
+    def __init__(self, folder, algorithm, settings=None, trace=False):
+        self.folder = pathlib.Path(folder)
+        self.algorithm = algorithm
+        self.settings = settings or {"config": asdict(algorithm.config)}
+        self.trace = trace
+        self.rows = []
+        self.trace_bytes = 0
+        self.lock = filelock.FileLock(self.folder / ".lock", timeout=0)
+
+    def begin(self):
+        """Begin in a folder that is new or empty. Returns the run."""
+        check_unused(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.own()
+        check_unused(self.folder)  # again, now that nobody else can begin in it
+        self.write_settings()
+        self.save()
+        return self
+
+    def resume(self):
+        """Go on from the last complete iteration; what came after it is forgotten. Returns the
+        run."""
+        self.own()
+        self.write_settings()
+        if (self.folder / "metrics.csv").exists():  # else it was stopped as soon as it had begun
+            self.load()
+        trace = self.folder / "trace.jsonl"
+        size = trace.stat().st_size if trace.exists() else 0
+        if size < self.trace_bytes:
+            raise InputError(
+                f"{trace} is missing or cut short: put the whole file back, or begin "
+                "anew with another --out"
+            )
+        if self.trace_bytes > 0:
+            self.trace = True
+            os.truncate(trace, self.trace_bytes)
+        self.save()
+        return self
+
+    def own(self):
+        try:
+            self.lock.acquire()
+        except filelock.Timeout:
+            raise InputError(
+                f"{self.folder} is in use by another process: wait for its end, or "
+                "choose another --out"
+            ) from None
+
+    def load(self):
+        """Take the state of the last complete iteration from the checkpoint; writes nothing."""
+        state = read_checkpoint(self.folder)
+        if state["settings"] != fixed(self.settings):
+            raise InputError(
+                f"{self.folder / 'checkpoint.pt'} is of another configuration than "
+                "config.json beside it: put the right one back"
+            )
+        try:
+            self.algorithm.load_state_dict(state["algorithm"])
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise damaged(self.folder, error) from None
+        self.rows = state["rows"]
+        self.trace_bytes = state["trace_bytes"]
+
+    def go(self, stop_at_full=False):
+        """Iterate until the budget is spent, or all is covered if that is to be the end. Returns
+        False after Ctrl-C, which goes back to the last complete iteration."""
+        print(self.header())
+        try:
+            while not self.is_done(stop_at_full):
+                began = time.monotonic()
+                iteration = self.algorithm.iterate()
+                self.keep(iteration, time.monotonic() - began)
+                print(self.line(), flush=True)
+        except KeyboardInterrupt:
+            print("\nstopped: going back to the last complete iteration", flush=True)
+            self.load()
+            return False
+        return True
+
+    def is_done(self, stop_at_full):
+        a = self.algorithm
+        is_full = len(a.discovered) >= (full_coverage(a.env) or math.inf)
+        return a.steps >= a.config.steps or (stop_at_full and is_full)
+
+    def keep(self, iteration, seconds):
+        """Keep what an iteration did: its row, its trace, the state after it."""
+        row = dict(iteration.metrics)
+        row["memory_mb"] = round(megabytes(self.algorithm, iteration), 3)
+        row["seconds"] = round(seconds, 2)
+        self.rows.append(row)
+        if self.trace:
+            with open(self.folder / "trace.jsonl", "ab") as file:
+                file.write(json.dumps(trace_of(iteration)).encode() + b"\n")
+                self.trace_bytes = file.tell()
+        self.save()
+
+    def save(self):
+        state = {
+            "settings": fixed(self.settings),
+            "rows": self.rows,
+            "trace_bytes": self.trace_bytes,
+            "algorithm": self.algorithm.state_dict(),
+        }
+        content = io.BytesIO()  # not to the file: torch has an error of its own for a full disk
+        torch.save(state, content)
+        write_atomically(self.folder / "checkpoint.pt", content.getvalue())
+        names = list(dict.fromkeys(name for row in self.rows for name in row))
+        lines = [names] + [[as_cell(row.get(name)) for name in names] for row in self.rows]
+        text = "".join(",".join(line) + "\n" for line in lines)
+        write_atomically(self.folder / "metrics.csv", text.encode())
+
+    def write_settings(self):
+        write_atomically(self.folder / "config.json", json.dumps(self.settings, indent=1).encode())
+
+    def header(self):
+        a = self.algorithm
+        full = full_coverage(a.env)
+        target = f"{full} {unit_name(a.env)} to cover" if full else "full coverage is not known"
+        headings = " ".join(f"{heading:>{width}}" for heading, width, _, _ in COLUMNS)
+        return (
+            f"{self.settings.get('method', 'rbexplore')}: {target}; seed {a.config.seed}; "
+            f"{a.config.steps:,} steps, {a.config.pretrain_steps:,} of them pretraining; "
+            f"run folder {self.folder}\n{headings}    left"
+        )
+
+    def line(self):
+        """What is shown of the latest iteration, with a warning where R tells little."""
+        row = self.rows[-1]
+        cells = []
+        for _, width, name, form in COLUMNS:
+            value = row.get(name)
+            cell = "-" if value is None else format(value, form)
+            cells.append(f"{cell:>{width}}")
+        recent = self.rows[-6:]
+        pace = sum(r["seconds"] for r in recent[1:]) / max(1, row["steps"] - recent[0]["steps"])
+        left = round(pace * (self.algorithm.config.steps - row["steps"]))
+        cells.append(f"{left // 60:4}:{left % 60:02}")
+        for name, finds in (("r_tpr", "new"), ("r_tnr", "known")):
+            rate = row.get(name)
+            if row["phase"] == "explore" and rate is not None and rate < 0.2:
+                cells.append(f"\n       warning: {name} is {rate:.2f}: R finds every state {finds}")
+        return " ".join(cells)
+
+    def summary(self):
+        a = self.algorithm
+        full = full_coverage(a.env)
+        seconds = sum(row["seconds"] for row in self.rows)
+        text = f"{a.steps:,} steps, {seconds:.0f} s: {len(a.discovered)} {unit_name(a.env)}"
+        if full:
+            text += f" of {full}, {100 * progress_metrics(a)['coverage']:.1f} %; steps to "
+            marks = steps_to(a.discovered, full)
+            text += ", ".join(f"{mark} %: {step or 'not reached'}" for mark, step in marks.items())
+        return text
 
 
-def pack(a: RbExplore | Baseline) -> dict:
-    """All that a run needs to go on, as tensors, numbers and strings (bytes as hex), which load without unpickling objects.
-    There is no generator in it: each is made from the seed, the iteration and a purpose."""
-    tensor, (parts, moments) = torch.as_tensor, kept(a)
-    state = {
-        "counters": [a.phase, a.iteration, a.steps, a.exploration_steps],
-        "discovered": [(list(unit), step) for unit, step in a.discovered.items()],
-        "networks": [part.state_dict() for part in parts],
-        "moments": [(m.count, tensor(m.mean), tensor(m.m2)) for m in moments],
-    }
-    if isinstance(a, PPO):
-        state["actors"] = [[x.hex() for x in a.snapshots], tensor(a.seen), tensor(a.ages), tensor(a.sums)]
-    if isinstance(a, Baseline):
-        return state
-    number: dict[Path, int] = {}  # each path once, parents first
-    for v in a.graph.clusters.values():
-        for link in v.path.chain():
-            number.setdefault(link, len(number))
-    return state | {
-        "buffer": [snapshot.hex() for snapshot in a.novel],
-        "replay": [(tensor(np.stack(p.states)), tensor(p.index), tensor(p.y), dict(p.counts)) for p in a.replay],
-        "paths": [(number.get(p.parent, -1), tensor(p.frames), [x.hex() for x in p.actions]) for p in number],
-        "clusters": [(id, v.snapshot.hex(), number[v.path], v.parent, v.visits) for id, v in a.graph.clusters.items()],
-        "arcs": [(*arc, visits) for arc, visits in a.graph.arcs.items()],
-        "graph": [a.graph.created, a.graph.assigned, a.graph.refused],
-    }
+COLUMNS = (  # heading, width, name in the row, format
+    ("iter", 5, "iteration", "d"),
+    ("phase", 8, "phase", "s"),
+    ("steps", 9, "steps", ",d"),
+    ("units", 6, "units", "d"),
+    ("%Cov", 6, "coverage", ".1%"),
+    ("clusters", 8, "clusters", "d"),
+    ("new", 4, "added", "d"),
+    ("merged", 6, "merged", "d"),
+    ("R's loss", 8, "r_loss", ".3f"),
+    ("TPR", 4, "r_tpr", ".2f"),
+    ("TNR", 4, "r_tnr", ".2f"),
+    ("novel", 6, "novel_share", ".1%"),
+    ("s", 5, "seconds", ".1f"),
+)
+BEGINNINGS = {".lock", "config.json.new"}  # what a run leaves that was killed before it began
 
 
-def unpack(a: RbExplore | Baseline, state: dict) -> None:
-    """Put a packed state into an algorithm of the same configuration."""
-    a.phase, a.iteration, a.steps, a.exploration_steps = state["counters"]
-    a.discovered = {tuple(unit): step for unit, step in state["discovered"]}
-    if isinstance(a, RbExplore):
-        a.novelty.errors = deque((Moments() for _ in state["moments"][1:]), a.config.novelty_window)
-    parts, moments = kept(a)
-    for part, saved in zip(parts, state["networks"], strict=True):
-        part.load_state_dict(saved)
-    for m, (count, mean, m2) in zip(moments, state["moments"], strict=True):
-        m.count, m.mean, m.m2 = count, mean.numpy(), m2.numpy()
-    if isinstance(a, PPO):
-        snapshots, *rest = state["actors"]
-        a.snapshots, (a.seen, a.ages, a.sums) = list(map(bytes.fromhex, snapshots)), (x.numpy() for x in rest)
-    if isinstance(a, Baseline):
-        return
-    a.novel = [bytes.fromhex(x) for x in state["buffer"]]
-    replay = [Pairs(list(s.numpy()), index.numpy(), y.numpy(), Counter(c)) for s, index, y, c in state["replay"]]
-    a.replay = deque(replay, a.config.replay_iterations)
-    paths: list[Path] = []
-    for parent, frames, actions in state["paths"]:
-        paths.append(Path(paths[parent] if parent >= 0 else None, frames.numpy(), tuple(map(bytes.fromhex, actions))))
-    g = a.graph
-    g.clusters = {id: Cluster(paths[p].frames[-1], bytes.fromhex(snapshot), paths[p], parent, visits)
-                  for id, snapshot, p, parent, visits in state["clusters"]}
-    g.arcs, g.adjacent = {}, {v: set() for v in g.clusters}
-    for start, end, visits in state["arcs"]:
-        g.add_arc(start, end, visits)
-    g.created, g.assigned, g.refused = state["graph"]
-    g.check()
+def check_unused(folder):
+    """Raise InputError for a folder that holds a run, or anything else; it is not touched."""
+    if (folder / "config.json").exists():
+        raise InputError(f"{folder} holds a run already: --resume it, or choose another --out")
+    if folder.exists() and {path.name for path in folder.iterdir()} - BEGINNINGS:
+        raise InputError(f"{folder} is not empty, and no run of ours: choose another --out")
 
 
-def memory(a: RbExplore) -> float:
-    """Megabytes of frames and snapshots that G and B hold."""
-    if isinstance(a, Baseline):
-        return 0.0
-    links = {link for v in a.graph.clusters.values() for link in v.path.chain()}
-    held = [*(v.snapshot for v in a.graph.clusters.values()), *a.novel]
-    return round((sum(link.frames.nbytes for link in links) + sum(map(len, held))) / 2**20, 3)
+def fixed(settings):
+    """What makes the run, of its settings: the rest may change when it goes on."""
+    free = ("workers", "rom", "state", "device", "versions")
+    kept = {name: value for name, value in settings.items() if name not in free}
+    kept["config"] = settings["config"] | {"steps": None}
+    return kept
 
 
-# ---------------------------------------------------------------------------------------------------- the run folder
-
-
-def write_atomically(path: pathlib.Path, write: Callable) -> None:
-    """A reader finds the old file or the new one and never half of one, also after a kill, or where the disk is full."""
-    temporary, content = path.with_name(path.name + ".new"), io.BytesIO()
-    write(content)  # not to the file: torch has an error of its own for a full disk
+def write_atomically(path, content):
+    """A reader finds the old file or the new one and never half of one, also after a kill, or where
+    the disk is full."""
+    temporary = path.with_name(path.name + ".new")
     try:
         with open(temporary, "wb") as file:
-            file.write(content.getbuffer())
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -1286,664 +1586,751 @@ def write_atomically(path: pathlib.Path, write: Callable) -> None:
         raise
 
 
-def load_checkpoint(folder: pathlib.Path, use: Callable):
-    """What `use` makes of the checkpoint in the folder; InputError where it cannot."""
-    path = folder / "checkpoint.pt"
+def read_checkpoint(folder):
+    """The checkpoint in the folder. InputError: it is missing or damaged."""
     try:
-        return use(torch.load(path, map_location="cpu", weights_only=True))  # load_state_dict moves what must move
+        state = torch.load(folder / "checkpoint.pt", map_location="cpu", weights_only=True)
+        return {name: state[name] for name in ("settings", "rows", "trace_bytes", "algorithm")}
     except Exception as error:  # torch raises many kinds for a file that is cut short
-        raise InputError(f"{path} cannot be loaded ({type(error).__name__}): it is missing or damaged; begin anew with "
-                         "another --out") from None
+        raise damaged(folder, error) from None
 
 
-class Run:
-    """A folder with config.json, metrics.csv, checkpoint.pt, trace.jsonl and the figures; and what one sees meanwhile."""
-
-    def __init__(self, folder: pathlib.Path, settings: dict, algorithm: RbExplore, trace: bool = False):
-        self.folder, self.settings, self.algorithm, self.tracing = folder, settings, algorithm, trace
-        self.rows, self.events, self.trace_bytes, self.live = [], [], 0, sys.stdout.isatty()
-        self.began = self.shown = time.monotonic()
-        algorithm.tell = self.tell
-
-    def create(self) -> None:
-        """Begin in a folder that holds no run yet."""
-        trace = self.folder / "trace.jsonl"  # ours is empty until there is a config.json
-        if (self.folder / "config.json").exists() or trace.exists() and trace.stat().st_size:
-            raise InputError(f"{self.folder} holds a run already: --resume it, or choose another folder with --out")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.save()  # before config.json, whose presence makes a run of the folder: a kill in between leaves none
-        write_atomically(self.folder / "config.json", lambda f: f.write(json.dumps(self.settings, indent=1).encode()))
-
-    def load(self) -> None:
-        """Take the state of the last complete iteration from the checkpoint; writes nothing."""
-        def take(state: dict) -> bool:
-            rows, trace_bytes, settings = list(state["rows"]), state["trace_bytes"], state["settings"]
-            same = all(settings[key] == self.settings[key] for key in ("method", "ppo", "env", "options", "config", "threads"))
-            if same:
-                unpack(self.algorithm, state["algorithm"])
-                self.rows, self.trace_bytes = rows, trace_bytes
-            return same
-
-        if not load_checkpoint(self.folder, take):
-            raise InputError(f"{self.folder / 'checkpoint.pt'} is of another configuration than config.json beside it: put the "
-                             "right one back, or begin anew with another --out")
-
-    def resume(self) -> None:
-        """Go on from the last complete iteration; what came after it is forgotten."""
-        self.load()
-        trace, self.events = self.folder / "trace.jsonl", []
-        if self.tracing and self.trace_bytes > (trace.stat().st_size if trace.exists() else 0):
-            raise InputError(f"{trace} is missing or cut short: put the whole file back, or begin anew with another --out")
-        self.write_metrics()
-        if self.tracing:
-            with open(trace, "ab") as file:
-                file.truncate(self.trace_bytes)
-
-    def save(self) -> None:
-        if self.tracing:
-            with open(self.folder / "trace.jsonl", "ab") as file:
-                file.writelines(json.dumps(event).encode() + b"\n" for event in self.events)
-                self.trace_bytes, self.events = file.tell(), []
-        state = {"settings": self.settings, "rows": self.rows, "trace_bytes": self.trace_bytes,
-                 "algorithm": pack(self.algorithm)}
-        write_atomically(self.folder / "checkpoint.pt", lambda f: torch.save(state, f))
-        self.write_metrics()  # last: resuming writes it anew from the checkpoint
-
-    def write_metrics(self) -> None:
-        lines = [",".join("" if row.get(name) is None else str(row[name]) for name in METRICS) for row in self.rows]
-        text = "\n".join([",".join(METRICS), *lines, ""])
-        write_atomically(self.folder / "metrics.csv", lambda f: f.write(text.encode()))
-
-    def tell(self, event: str, **data) -> None:
-        """Hear of the algorithm: show progress, keep the trace, and save at the end of an iteration."""
-        if event == "progress":
-            now = time.monotonic()
-            if now - self.shown > (0.2 if self.live else 30):
-                self.shown = now
-                line = f"   {data['step']}: {data['done']} of {data['total']}"
-                print(f"\r{line:<50}" if self.live else line, end="" if self.live else "\n", flush=True)
-        elif event == "row":
-            row, now = data["row"], time.monotonic()
-            row |= {"seconds": round(now - self.began, 2), "memory_mb": memory(self.algorithm)}
-            self.began = self.shown = now
-            self.rows.append(row)
-            self.save()
-            self.show(row)
-        elif self.tracing:
-            self.events.append({"event": event, **data})
-
-    COLUMNS = (  # heading, width, name in the row, format
-        ("iter", 6, "iteration", "d"), ("phase", 8, "phase", "s"), ("steps", 9, "steps", ",d"), ("clusters", 8, "clusters", "d"),
-        ("new", 5, "added", "d"), ("merged", 6, "merged", "d"), ("%Cov", 6, "coverage", ".1%"), ("R's loss", 8, "r_loss", ".3f"),
-        ("acc", 5, "r_accuracy", ".3f"), ("TPR", 5, "r_true_positive", ".3f"), ("TNR", 5, "r_true_negative", ".3f"),
-        ("novel", 6, "novel_share", ".1%"), ("s", 6, "seconds", ".1f"))
-
-    def show(self, row: dict) -> None:
-        """A line for an iteration."""
-        before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
-        pace = sum(r["seconds"] for r in self.rows[-5:]) / max(1, row["steps"] - before)
-        left = round(pace * (self.settings["config"]["steps"] - row["steps"]))
-        cells = [f"{'-' if row.get(name) is None else format(row[name], form):>{width}}" for _, width, name, form in self.COLUMNS]
-        if row["coverage"] is None:
-            cells[6] = f"{row['units']:>5}u"
-        print(("\r" if self.live else "") + " ".join(cells) + f" {left // 60:4}:{left % 60:02}", flush=True)
-        if row["phase"] == "explore":
-            for name, what in (("r_true_positive", "every state new"), ("r_true_negative", "every state known")):
-                if row.get(name) is not None and row[name] < 0.2:
-                    print(f"       warning: {name} is {row[name]:.2f}: R finds {what}, so G tells little")
-        if row.get("clusters") and self.algorithm.graph.refused and row["clusters"] >= self.algorithm.config.max_clusters:
-            print(f"       max_clusters has kept {self.algorithm.graph.refused} states from making a cluster so far")
+def damaged(folder, error):
+    path = folder / "checkpoint.pt"
+    return InputError(
+        f"{path} cannot be loaded ({type(error).__name__}): it is missing or "
+        "damaged; begin anew with another --out"
+    )
 
 
-# --------------------------------------------------------------------------------------------------------- the figures
+def as_cell(value):
+    return "" if value is None else str(value)
 
 
-def new_figure(width: float, height: float):
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError("figures need matplotlib: pip install matplotlib, or give --no-figures") from None
-    return Figure(figsize=(width, height), layout="constrained")
+def trace_of(iteration):
+    """What an iteration did, as plain data: where each trajectory began, how novel its states were
+    and to which clusters they went, and what merged."""
+    explored = []
+    for tau in iteration.trajectories:
+        novelty = [float(x) if np.isfinite(x) else None for x in tau.novelty]
+        explored.append({"start": tau.start, "novelty": novelty, "clusters": tau.clusters})
+    return {
+        "iteration": iteration.metrics["iteration"],
+        "explored": explored,
+        "additional": [tau.start for tau in iteration.additional],
+        "pairs": len(iteration.pairs),
+        "merged": list(iteration.merged.items()),
+    }
 
 
-def draw_figures(run: Run) -> list[str]:
-    """Draw what the run has found so far; returns the names of the files."""
-    a = run.algorithm
-    unit_of = {}  # cluster -> coverage unit, by rolling back: G itself does not know units
-    graph = None if isinstance(a, Baseline) else a.graph
-    for v, cluster in graph.clusters.items() if graph else ():
-        a.env.restore(cluster.snapshot)
-        if a.env.unit() is not None:
-            unit_of[v] = unit_key(a.env.unit())
-    a.env.restore(a.snap_init)
-    drawing, grid = level_drawing(a.env, {*a.discovered, *unit_of.values()}), np.linspace(0, a.steps, 1001).astype(int)
-    full, unit = getattr(a.env, "full_coverage", None), unit_name(a.env)
-    curves = {run.settings["method"]: {a.config.seed: coverage_curve(a.discovered, grid, full)}}
-    figures = {"coverage.png": curves_figure(grid, curves, full, unit, a.config.pretrain_steps)}
-    if graph:
-        figures["centres.png"] = centres_figure(a)
-    if drawing[1]:
-        share = f"{100 * len(a.discovered) / full:.1f} % of {full}" if full else f"{len(a.discovered)}"
-        figures["coverage_map.png"] = maps_figure(drawing, {f"after {a.steps:,} steps: {share} {unit}": a.discovered}, a.steps)
-        figures |= {"graph.png": graph_figure(a, drawing, unit_of)} if graph else {}
-    save_figures(run.folder, figures)
-    return list(figures)
+def megabytes(algorithm, iteration):
+    """Frames and snapshots that the iteration and G held."""
+    size = 0
+    for tau in iteration.trajectories + iteration.additional:
+        size += tau.frames.nbytes + sum(map(len, tau.snapshots))
+    if isinstance(algorithm, RbExplore):
+        graph = algorithm.graph
+        size += sum(arc.prefix.nbytes for arc in graph.E_parent.values())
+        size += sum(len(v.snapshot) for v in graph.clusters.values())
+    return size / 2**20
 
 
-def save_figures(folder: pathlib.Path, figures: dict) -> None:
-    for name, figure in figures.items():
-        write_atomically(folder / name, lambda f, figure=figure: figure.savefig(f, format="png", dpi=120))
+def full_coverage(env):
+    return getattr(env, "full_coverage", None)
 
 
-def level_drawing(env, units: set[tuple]) -> tuple[np.ndarray, dict, list]:
-    """A picture of the level (H, W, 3), the box of each unit in it (left, top, width, height), and names (x, y, name)."""
-    drawn = env.level_map() if hasattr(env, "level_map") else None
-    return (*drawn, []) if drawn else rooms_map(units)
-
-
-def rooms_map(units: set[tuple]) -> tuple[np.ndarray, dict, list]:
-    """Where the environment draws no level: a panel for each room, in it a square for each unit (room, x, y) known."""
-    places = {u: (u[:-2], *((0, 0, *u)[-2:])) for u in units}  # (5,) is x = 0, y = 5 of the only room
-    rooms, xs, ys = (sorted({place[k] for place in places.values()}) for k in range(3))
-    if not units or not all(isinstance(x, int) for x in (*xs, *ys)):
-        return np.zeros((1, 1, 3), np.uint8), {}, []
-    width, height, across, side = xs[-1] - xs[0] + 2, ys[-1] - ys[0] + 3, math.ceil(math.sqrt(len(rooms))), 12
-    corner = {room: (k % across * width, k // across * height + 1) for k, room in enumerate(rooms)}
-    boxes = {u: ((corner[room][0] + x - xs[0]) * side, (corner[room][1] + y - ys[0]) * side, side, side)
-             for u, (room, x, y) in places.items()}
-    labels = [(x * side, y * side, "room " + " ".join(map(str, room))) for room, (x, y) in corner.items() if room]
-    rows = math.ceil(len(rooms) / across)
-    return np.full((rows * height * side, across * width * side, 3), 40, np.uint8), boxes, labels
-
-
-def steps_to(times: list[int], full: int) -> dict[int, str | None]:
-    """Per cent of full coverage -> the step that reached it, if one did; times: of the first visits, sorted."""
-    needed = {share: math.ceil(full * share / 100) for share in (50, 90, 100)}
-    return {share: f"{times[k - 1]:,}" if len(times) >= k else None for share, k in needed.items()}
-
-
-def coverage_curve(discovered: dict[tuple, int], grid: np.ndarray, full: int | None) -> np.ndarray:
-    """Coverage after each number of steps of the grid: %, or units where full coverage is not known."""
-    return np.searchsorted(sorted(discovered.values()), grid, "right") * (100 / full if full else 1)
-
-
-def curves_figure(grid: np.ndarray, curves: dict[str, dict[int, np.ndarray]], full: int | None, unit: str, pretraining: int = 0):
-    """Coverage against agent steps: for each variant the mean of its runs, and a band from their least to their most."""
-    figure = new_figure(7, 4)
-    axes = figure.subplots()
-    for variant, of in curves.items():
-        runs = np.stack(list(of.values()))  # (runs, points of the grid)
-        (line,) = axes.plot(grid, runs.mean(0), label=variant)
-        axes.fill_between(grid, runs.min(0), runs.max(0), color=line.get_color(), alpha=0.2, linewidth=0)  # S6.2-05
-    if pretraining:
-        axes.axvspan(0, pretraining, color="0.9", label="pretraining")
-    axes.set(xlabel="agent steps (exploration, additional, pretraining)", xlim=(0, max(1, grid[-1])),
-             ylabel=f"coverage, % of {full} {unit}" if full else f"{unit} covered", ylim=(0, 102 if full else None))
-    axes.legend(loc="lower right" if len(curves) == 1 else "best")
-    return figure
-
-
-def unit_name(env) -> str:
+def unit_name(env):
     return getattr(env, "unit_name", "units")
 
 
-def show_level(axes, level: np.ndarray, labels: list, title: str) -> None:
-    axes.imshow(level)
-    axes.set(title=title, xticks=[], yticks=[])
-    for x, y, name in labels:
-        axes.text(x, y, name, color="white", fontsize=8, verticalalignment="bottom")
+def steps_to(discovered, full):
+    """Per cent of full coverage -> the step that reached it; None where none did."""
+    times = sorted(discovered.values())
+    marks = {}
+    for mark in (50, 90, 100):
+        needed = math.ceil(full * mark / 100)
+        marks[mark] = times[needed - 1] if len(times) >= needed else None
+    return marks
 
 
-def maps_figure(drawing: tuple, found: dict[str, dict[tuple, int]], steps: int):
-    """Coverage maps, one for each title: visited units coloured by the step of the first visit, the others crossed out."""
-    level, boxes, labels = drawing
-    across, width = min(3, len(found)), 10 if len(found) == 1 else 5
-    down = math.ceil(len(found) / across)
-    figure = new_figure(width * across + 1.5, (width * level.shape[0] / level.shape[1] + 0.7) * down)
-    panels = figure.subplots(down, across, squeeze=False).ravel()
-    for axes, (title, discovered) in zip(panels, found.items(), strict=False):
-        show_level(axes, level, labels, title)
-        heat = np.full(level.shape[:2], np.nan)
-        for unit, (x, y, w, h) in boxes.items():
-            if unit in discovered:
-                heat[y : y + h, x : x + w] = discovered[unit]
-            else:
-                axes.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
-        image = axes.imshow(heat, cmap="viridis_r", alpha=0.6, vmin=0, vmax=steps)
-    figure.colorbar(image, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
-    return figure
-
-
-def graph_figure(a: RbExplore, drawing: tuple, unit_of: dict):
-    """G over the level: a disc for each cluster, its area by the visits; a line for each arc, its width by the visits."""
-    level, boxes, labels = drawing
-    figure = new_figure(10, 10 * level.shape[0] / level.shape[1] + 0.9)
-    axes = figure.subplots()
-    show_level(axes, level, labels, f"graph: {len(a.graph.clusters)} clusters, {len(a.graph.arcs)} arcs")
-    place, crowd = {}, Counter()
-    for v, unit in unit_of.items():
-        if unit in boxes:
-            x, y, w, h = boxes[unit]
-            turn, crowd[unit] = 2.4 * crowd[unit], crowd[unit] + 1  # clusters of one unit stand around its middle
-            radius = 0 if crowd[unit] == 1 else 0.3
-            place[v] = x + w * (0.5 + radius * math.cos(turn)), y + h * (0.5 + radius * math.sin(turn))
-    most = max(v.visits for v in a.graph.clusters.values())
-    for (start, end), visits in a.graph.arcs.items():
-        if start in place and end in place:
-            axes.plot(*zip(place[start], place[end], strict=True), color="white", alpha=0.5,
-                      linewidth=0.3 + min(2.0, 0.2 * math.log1p(visits)))
-    ids = list(place)
-    points = axes.scatter(*zip(*(place[v] for v in ids), strict=True), c=ids, cmap="plasma", edgecolors="black", zorder=3,
-                          s=[12 + 300 * a.graph.clusters[v].visits / most for v in ids])
-    figure.colorbar(points, label="cluster, in the order of creation", shrink=0.8)
-    return figure
-
-
-def centres_figure(a: RbExplore, most: int = 80):
-    """A contact sheet: the centres of the clusters, at most so many, evenly from all, with number and visits."""
-    ids = list(a.graph.clusters)
-    shown = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(most, len(ids))).astype(int))]
-    across = min(10, len(shown))
-    figure = new_figure(across * 1.1 + 0.2, math.ceil(len(shown) / across) * 1.3 + 0.4)
-    figure.suptitle(f"centres of {len(shown)} of {len(ids)} clusters: number, visits", fontsize=9)
-    panels = np.ravel(figure.subplots(math.ceil(len(shown) / across), across, squeeze=False))
-    for axes in panels:
-        axes.axis("off")
-    for axes, v in zip(panels, shown, strict=False):
-        axes.imshow(a.graph.clusters[v].frame.squeeze(), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-        axes.set_title(f"{v}: {a.graph.clusters[v].visits:,}", fontsize=7)
-    return figure
-
-
-# ------------------------------------------------------------------- the policy pi^p of section 3.2, checked and exported
-
-
-def verify(a: RbExplore) -> tuple[str, bool]:
-    """For every cluster: replay its actions from s_init, restore its snapshot, and compare both with its centre, exactly.
-    Returns a table, and whether all agree."""
-    lines, wrong = [f"{'cluster':>9}{'visits':>9}{'steps from s_init':>19}   replayed   restored"], 0
-    for v, cluster in a.graph.clusters.items():
-        actions = cluster.path.replay()
-        frame, ended = a.env.restore(a.snap_init), False
-        for action in actions:
-            ended = ended or a.env.step(action + int(a.env.action_space.start))[2]
-        if actions and not ended:
-            frame = a.env.restore(a.env.snapshot())
-        replayed, unit = np.array_equal(frame, cluster.frame) and not ended, a.env.unit()
-        restored = np.array_equal(a.env.restore(cluster.snapshot), cluster.frame)
-        replayed = replayed and unit == a.env.unit()
+def verify(algorithm):
+    """For each cluster replay its actions from s_init and restore its snapshot, and compare both
+    with its centre, exactly (S3.2-01, S3.2-03). Returns a table, and whether all agree."""
+    env = algorithm.env
+    graph = algorithm.graph
+    lines = [f"{'cluster':>9}{'visits':>9}{'steps from s_init':>19}   replayed   restored"]
+    wrong = 0
+    for v, cluster in graph.clusters.items():
+        actions = graph.replay(v)
+        frame, unit = play(env, cluster.snapshot, b"")
+        restored = np.array_equal(frame, cluster.frame)
+        frame, replayed_unit = play(env, algorithm.initial_state.snapshot, actions)
+        replayed = np.array_equal(frame, cluster.frame) and replayed_unit == unit
         wrong += not (replayed and restored)
-        answers = ["exact" if good else "DIFFERS" for good in (replayed, restored)]
+        answers = ["exact" if right else "DIFFERS" for right in (replayed, restored)]
         lines.append(f"{v:9}{cluster.visits:9,}{len(actions):19,}   {answers[0]:8}   {answers[1]}")
-    lines.append(f"{len(a.graph.clusters) - wrong} of {len(a.graph.clusters)} clusters are reached exactly, both ways")
-    return "\n".join(lines), not wrong
+    total = len(graph.clusters)
+    lines.append(f"{total - wrong} of {total} clusters are reached exactly, both ways")
+    return "\n".join(lines), wrong == 0
 
 
-def export_demos(a: RbExplore, path: pathlib.Path) -> None:
-    """The actions that lead from s_init to each centre, as demonstrations: actions[offsets[k]:offsets[k + 1]] lead to the
-    centre of cluster clusters[k], whose frame is centres[k]."""
-    demos = [np.frombuffer(v.path.replay(), np.uint8) for v in a.graph.clusters.values()]
-    arrays = {"clusters": np.array(list(a.graph.clusters)), "offsets": np.cumsum([0, *map(len, demos)]),
-              "actions": np.concatenate(demos), "centres": np.stack([v.frame for v in a.graph.clusters.values()])}
-    write_atomically(path, lambda f: np.savez_compressed(f, **arrays))
+def play(env, snapshot, actions):
+    """Roll back and do the actions: the frame and the coverage unit then; no frame after an end."""
+    frame = env.restore(snapshot)
+    for action in actions:
+        frame, _, terminated, _, _ = env.step(action + int(env.action_space.start))
+        if terminated:
+            return None, None
+    return frame, unit_key(env.unit())
 
 
-# ---------------------------------------------------------------------------------------------------------- the profile
+# -------------------------------------------------------------------------------- the figures
 
 
-class Profile:
-    """Seconds per step of the iteration: environment, network mathematics, the rest. It wraps functions from outside."""
-
-    STEPS = {"explore": "1 explore", "make_pairs": "2 pairs", "train_similarity": "3 train R", "update_graph": "4 update G",
-             "train_novelty": "5 train RND"}
-
-    def __init__(self, algorithm: RbExplore, run: Run):
-        self.seconds, self.step, self.depth = Counter(), "run folder, start", 0
-        a = algorithm
-        if isinstance(a, Baseline) or isinstance(a.similarity, Cells) or a.executor:
-            raise InputError("--profile is for --method rbexplore with one worker")
-        for name in self.STEPS:
-            self.wrap(a, name, None)
-        for name in ("step", "snapshot", "restore", "unit"):
-            self.wrap(a.env, name, "environment")
-        for owner, names in ((a.similarity, ("embed", "probability", "score", "update")), (a.novelty, ("distance", "update"))):
-            for name in names:
-                self.wrap(owner, name, "network")
-
-    def wrap(self, owner, name: str, kind: str | None) -> None:
-        inner = getattr(owner, name)
-
-        def timed(*arguments, **named):
-            before, self.depth, start = self.step, self.depth + (kind is not None), time.perf_counter()
-            self.step = self.step if kind else self.STEPS[name]
-            try:
-                return inner(*arguments, **named)
-            finally:
-                self.depth -= kind is not None
-                if kind is None or self.depth == 0:
-                    self.seconds[self.step, kind or "all"] += time.perf_counter() - start
-                self.step = before
-
-        object.__setattr__(owner, name, timed)
-
-    def table(self, total: float) -> str:
-        """Rows: the steps; columns: where the seconds went."""
-        lines = [f"{'':20}{'environment':>13}{'network':>10}{'rest':>8}{'all':>8}{'share':>8}"]
-        inside = sum(self.seconds[name, "all"] for name in self.STEPS.values())
-        sums = Counter()
-        for name in (*self.STEPS.values(), "run folder, start"):
-            env, net = self.seconds[name, "environment"], self.seconds[name, "network"]
-            whole = self.seconds[name, "all"] if name in self.STEPS.values() else total - inside
-            lines.append(f"{name:20}{env:13.2f}{net:10.2f}{whole - env - net:8.2f}{whole:8.2f}{whole / total:8.1%}")
-            sums.update(env=env, net=net)
-        rest = total - sums["env"] - sums["net"]
-        lines.append(f"{'all':20}{sums['env']:13.2f}{sums['net']:10.2f}{rest:8.2f}{total:8.2f}")
-        return "\n".join([*lines, f"outside environment steps and network mathematics: {rest / total:.1%} of the wall time"])
+def draw(run):
+    """Draw the figures of a run into its folder. Returns a line that names them, or why there are
+    none: a figure that cannot be drawn never hides a finished run."""
+    try:
+        names = save_figures(run.folder, run_figures(run.algorithm))
+    except Exception as error:
+        return f"{run.folder}: figures could not be drawn ({type(error).__name__}: {error})"
+    return f"{run.folder}: config.json, metrics.csv, checkpoint.pt, {', '.join(names)}"
 
 
-# ----------------------------------------------------------------------- the experiments (6.2, 6.3; S6.2-05, 06, S6.3-01 ... 03)
+def run_figures(a):
+    """File name -> figure, of an algorithm as it stands."""
+    figures = {"coverage.png": curves_figure({"": [a.discovered]}, a.env, a.config)}
+    level = Level(a.env, a.discovered)
+    if level.boxes:
+        title = f"{len(a.discovered)} {unit_name(a.env)} after {a.steps:,} steps (red: not visited)"
+        figures["coverage_map.png"] = maps_figure(level, {title: a.discovered}, a.steps)
+    if isinstance(a, RbExplore):
+        figures["centres.png"] = centres_figure(a.graph)
+        figures["route.gif"] = route_animation(a.graph)
+        # G itself does not know units.
+        units = {v: play(a.env, c.snapshot, b"")[1] for v, c in a.graph.clusters.items()}
+        places = {v: level.boxes[unit] for v, unit in units.items() if unit in level.boxes}
+        if places:
+            figures["graph.png"] = graph_figure(a.graph, level, places)
+    return figures
+
+
+def save_figures(folder, figures):
+    """Write them; returns their names."""
+    for name, figure in figures.items():
+        content = io.BytesIO()
+        if name.endswith(".gif"):
+            figure[0].save(content, "gif", save_all=True, append_images=figure[1:], duration=80)
+        else:
+            figure.savefig(content, format="png", dpi=120)
+        write_atomically(folder / name, content.getvalue())
+    return list(figures)
+
+
+def new_figure(width, height):
+    """A matplotlib figure by matplotlib's own defaults, not by the user's backend or settings."""
+    os.environ["MPLBACKEND"] = "agg"  # a notebook sets one that matplotlib may refuse
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError(
+            "figures need matplotlib: pip install matplotlib, or give --no-figures"
+        ) from None
+    matplotlib.rcdefaults()
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+class Level:
+    """Where units lie in a picture. boxes: unit -> (left, top, width, height): by the environment's
+    level_map(), else squares at (x, y), those of a room, (..., x, y), in a panel of its own."""
+
+    def __init__(self, env, units):
+        self.picture = None
+        if hasattr(env, "level_map"):
+            self.picture, self.boxes = env.level_map()
+        else:
+            self.boxes = room_panels(units)
+        corners = [(left + w, top + h) for left, top, w, h in self.boxes.values()]
+        self.width, self.height = np.max(corners, axis=0) if corners else (1, 1)
+        self.aspect = float(np.clip(self.height / self.width, 0.2, 1.5))  # to be legible
+
+    def show(self, panel, title):
+        panel.set(title=title, xticks=[], yticks=[], facecolor="0.15")
+        panel.set(xlim=(0, self.width), ylim=(self.height, 0))
+        if self.picture is not None:
+            panel.imshow(self.picture, extent=(0, self.width, self.height, 0), aspect="auto")
+
+
+def room_panels(units):
+    """A box for each unit that ends with two whole numbers, or is one; the others have no place."""
+    places = {}
+    for unit in units:
+        if len(unit) == 1:
+            places[unit] = ((), unit[0], 0)
+        elif len(unit) > 1:
+            places[unit] = (unit[:-2], unit[-2], unit[-1])
+    places = {u: place for u, place in places.items() if all(isinstance(z, int) for z in place[1:])}
+    if not places:
+        return {}
+    rooms, xs, ys = zip(*places.values(), strict=True)
+    order = sorted(set(rooms), key=str)
+    across = math.ceil(math.sqrt(len(order)))
+    boxes = {}
+    for unit, (room, x, y) in places.items():
+        k = order.index(room)
+        left = k % across * (max(xs) - min(xs) + 2) + x - min(xs)
+        top = k // across * (max(ys) - min(ys) + 2) + y - min(ys)
+        boxes[unit] = (left, top, 1, 1)
+    return boxes
+
+
+def coverage_curve(discovered, grid, full):
+    """Coverage after each number of steps of the grid: in %, or in units."""
+    visited = np.searchsorted(sorted(discovered.values()), grid, "right")
+    return np.minimum(100.0, visited * 100 / full) if full else visited
+
+
+def curves_figure(runs, env, config):
+    """Coverage against steps: for each variant the mean of its runs, and a band from their least to
+    their most (S6.2-05). runs: variant -> first visits, unit -> step, of each run."""
+    figure = new_figure(7, 4)
+    panel = figure.subplots()
+    full = full_coverage(env)
+    grid = np.linspace(0, config.steps, 501).astype(int)
+    if config.pretrain_steps:
+        panel.axvspan(0, config.pretrain_steps, color="0.9", label="pretraining")
+    for k, (variant, discovered) in enumerate(runs.items()):
+        curves = np.stack([coverage_curve(d, grid, full) for d in discovered])  # (runs, grid)
+        style = ("-", "--", "-.", ":")[k % 4]  # so that curves which coincide are both seen
+        (drawn,) = panel.plot(grid, curves.mean(0), style, label=variant)
+        least = curves.min(0)
+        most = curves.max(0)
+        panel.fill_between(grid, least, most, color=drawn.get_color(), alpha=0.2, linewidth=0)
+    panel.set_xlabel("agent steps (exploration, additional, pretraining)")
+    panel.set_ylabel(f"coverage, % of {full} {unit_name(env)}" if full else unit_name(env))
+    panel.set(xlim=(0, config.steps), ylim=(0, 102 if full else None))
+    panel.legend()
+    return figure
+
+
+def maps_figure(level, found, steps):
+    """Coverage maps: visited units in the colour of the step of the first visit, others crossed
+    out. found: title -> first visits, unit -> step."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    across = min(3, len(found))
+    down = math.ceil(len(found) / across)
+    width = 10 if across == 1 else 5
+    figure = new_figure(width * across + 1, (width * level.aspect + 0.5) * down)
+    panels = figure.subplots(down, across, squeeze=False).ravel()
+    for panel in panels[len(found) :]:
+        panel.axis("off")
+    for panel, (title, discovered) in zip(panels, found.items(), strict=False):
+        level.show(panel, title)
+        tiles = []
+        firsts = []
+        for unit, (x, y, w, h) in level.boxes.items():
+            if unit in discovered:
+                tiles.append(Rectangle((x, y), w, h))
+                firsts.append(discovered[unit])
+            else:
+                panel.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
+        colours = PatchCollection(tiles, cmap="viridis_r", alpha=0.7)
+        colours.set_array(firsts)
+        colours.set_clim(0, steps)
+        panel.add_collection(colours)
+    bar = figure.colorbar(colours, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
+    bar.solids.set_alpha(1)
+    return figure
+
+
+def graph_figure(graph, level, places):
+    """G over the level: a disc for each cluster, its area by its visits; arcs fainter the rarer
+    they are. places: cluster -> the box of its unit."""
+    figure = new_figure(10, 10 * level.aspect + 0.5)
+    panel = figure.subplots()
+    level.show(panel, f"graph: {len(graph.clusters)} clusters, {len(graph.arcs)} arcs")
+    at = {}
+    crowd = Counter()
+    for v, box in places.items():
+        x, y, w, h = box
+        radius = 0.3 if crowd[box] else 0.0  # clusters of one unit stand around its middle
+        angle = 2.4 * crowd[box]
+        at[v] = (x + w * (0.5 + radius * math.cos(angle)), y + h * (0.5 + radius * math.sin(angle)))
+        crowd[box] += 1
+    busiest = max(graph.arcs.values(), default=1)
+    for (start, end), visits in graph.arcs.items():
+        if start in at and end in at:
+            share = math.log1p(visits) / math.log1p(busiest)
+            xs, ys = zip(at[start], at[end], strict=True)
+            panel.plot(xs, ys, color="white", alpha=0.1 + 0.6 * share, linewidth=0.3 + 2 * share)
+    most = max(v.visits for v in graph.clusters.values())
+    sizes = [12 + 300 * graph.clusters[v].visits / most for v in at]
+    xs, ys = zip(*at.values(), strict=True)
+    discs = panel.scatter(xs, ys, sizes, list(at), cmap="plasma", edgecolors="black", zorder=3)
+    figure.colorbar(discs, label="cluster, in the order of creation", shrink=0.8)
+    return figure
+
+
+def centres_figure(graph, most=80):
+    """The centres of the clusters, at most so many, evenly from all, with number and visits."""
+    ids = list(graph.clusters)
+    shown = ids[:: math.ceil(len(ids) / most)]
+    across = min(10, len(shown))
+    down = math.ceil(len(shown) / across)
+    figure = new_figure(across * 1.1 + 0.2, down * 1.3 + 0.4)
+    figure.suptitle(f"{len(shown)} of {len(ids)} centres: number, visits", fontsize=9)
+    panels = figure.subplots(down, across, squeeze=False).ravel()
+    for panel in panels:
+        panel.axis("off")
+    for panel, v in zip(panels, shown, strict=False):
+        cluster = graph.clusters[v]
+        picture = viewable(cluster.frame)
+        panel.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        panel.set_title(f"{v}: {cluster.visits:,}", fontsize=7)
+    return figure
+
+
+def viewable(frame):
+    """A frame as a picture: grey (H, W), or red, green and blue (H, W, 3)."""
+    if frame.ndim == 2 or frame.shape[2] == 3:
+        return frame
+    return frame.mean(2).astype(np.uint8)
+
+
+def route_animation(graph):
+    """The way from s_init to the cluster that is furthest from it: frames of an animation."""
+    from PIL import Image
+
+    furthest = max(graph.clusters, key=lambda v: len(graph.replay(v)))
+    states = graph.full_prefix(furthest) or [graph.clusters[0].frame]
+    scale = max(1, 256 // max(states[0].shape[:2]))
+    frames = [viewable(s).repeat(scale, axis=0).repeat(scale, axis=1) for s in states]
+    return [Image.fromarray(frame) for frame in frames]
+
+
+# ---------------------- the experiments (6.2, 6.3; S6.2-05, S6.2-06, S6.3-01, S6.3-02, S6.3-03)
 
 EXPERIMENTS = {  # variant -> what its runs alone have on the command line
-    "methods": {method: ["--method", method] for method in METHODS},
+    "methods": {method: [f"--method={method}"] for method in METHODS},
     "ablation": {"rbexplore": [], "no-merge": ["--no-merge"], "no-prefix": ["--no-prefix"]},
-    "theta-merge": {f"theta-merge-{theta}": ["--theta-merge", theta] for theta in ("0.25", "0.5", "0.75")}}
+    "theta-merge": {f"theta-merge-{x}": [f"--theta-merge={x}"] for x in ("0.25", "0.5", "0.75")},
+}
 
 
-def runs_of(args: argparse.Namespace) -> dict[tuple[str, int], list[str]]:
-    """(variant, seed) -> the command line of that run: what `args` says, the variant's own, the seed; its folder is last."""
-    shared, env, first = ["--no-figures"], args.env or "maze", args.seed or 0
+def runs_of(args):
+    """(variant, seed) -> the command line of that run: what `args` says, then the variant's own."""
+    shared = ["--no-figures"]
     for name, value in vars(args).items():
-        if value is not None and name not in ("experiment", "seeds", "seed", "out", "trace", "profile", "no_figures"):
-            flag = name.replace("_", "-")
-            shared += [(f"--{flag}" if value else f"--no-{flag}") if isinstance(value, bool) else f"--{flag}={value}"]
-    out = args.out or f"runs/{args.experiment}-{env}"
-    return {(variant, seed): [*shared, *own, "--seed", str(seed), "--out", f"{out}/{variant}-{seed}"]
-            for seed in range(first, first + (args.seeds or 3)) for variant, own in EXPERIMENTS[args.experiment].items()
-            if variant != "oracle" or env == "maze"}
+        flag = name.replace("_", "-")
+        if value is None or name in ("experiment", "seeds", "seed", "out", "no_figures"):
+            continue
+        if isinstance(value, bool):
+            shared.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            shared.append(f"--{flag}={value}")
+    first = args.seed or 0
+    runs = {}
+    for seed in range(first, first + (args.seeds or 3)):
+        for variant, options in EXPERIMENTS[args.experiment].items():
+            out = f"--out={experiment_folder(args)}/{variant}-{seed}"
+            runs[variant, seed] = [*shared, *options, f"--seed={seed}", out]
+    return runs
 
 
-def execute(command: list[str]) -> str:
-    """Run it in a process of its own, or go on where it was interrupted, or find it finished. Returns what was done."""
-    folder, settings = pathlib.Path(command[-1]), settings_of(parser().parse_args(command))
-    if (folder / "config.json").exists():
-        free = {"versions": 0, "workers": 0}  # may differ
-        if recorded_settings(str(folder), parser().parse_args([])) | free != settings | free:
-            raise InputError(f"{folder} holds a run of another configuration: choose another --out")
-        steps = load_checkpoint(folder, lambda state: max((row["steps"] for row in state["rows"]), default=0))
-        if steps >= settings["config"]["steps"]:
-            return f"{folder} was finished"
-        command = ["--resume", str(folder), "--no-figures", "--workers", str(settings["workers"])]
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / "log.txt", "a") as log:
-        code = subprocess.run([sys.executable, __file__, *command], stdout=log, stderr=log).returncode
-    if code:
-        raise InputError(f"{folder} ended with code {code}: log.txt there says why; the same command goes on with the rest")
-    return f"{folder} done"
+def experiment_folder(args):
+    return pathlib.Path(args.out or f"runs/{args.experiment}-{args.env or 'maze'}")
 
 
-def experiment(args: argparse.Namespace) -> int:
-    """All runs, side by side where there are cores; then curves.csv with all curves, the figures, and a line for each run."""
-    runs = runs_of(args)
-    settings = [settings_of(parser().parse_args(command)) for command in runs.values()][0]  # all: an error shows before any run
-    env, grid = make_env(settings["env"], **settings["options"]), np.linspace(0, settings["config"]["steps"], 201).astype(int)
-    with ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // (args.workers or 1))) as pool:
+def experiment(args):
+    """All runs, side by side where there are cores; then what they found. A run that fails is named
+    when all others are done."""
+    runs = {key: parser().parse_args(command) for key, command in runs_of(args).items()}
+    for run in runs.values():
+        check_same(run)
+    settings = settings_of(next(iter(runs.values())))
+    env = make_env(settings["env"], **options_of(settings))  # its errors show before any run
+    side_by_side = max(1, cores() // (settings["workers"] * settings["threads"]))
+    print(f"{len(runs)} runs, {side_by_side} at a time; the log of each is beside its folder")
+    with ThreadPoolExecutor(side_by_side) as pool:
+        jobs = [pool.submit(run_apart, command) for command in runs_of(args).values()]
         try:
-            for line in pool.map(execute, runs.values()):
-                print(line, flush=True)
-        except BaseException:  # Ctrl-C too, which the running processes hear by themselves
-            pool.shutdown(cancel_futures=True)
+            codes = [job.result() for job in jobs]
+        except BaseException:  # Ctrl-C: no run is begun any more, and those that run are ended
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
             raise
-    out = pathlib.Path(next(iter(runs.values()))[-1]).parent
-    full, found, curves = env.full_coverage, {}, {}
-    for (variant, seed), command in runs.items():
-        discovered = load_checkpoint(pathlib.Path(command[-1]), lambda state: state["algorithm"]["discovered"])
-        found[variant, seed] = {tuple(unit): step for unit, step in discovered}
-        times = sorted(found[variant, seed].values())
-        curves.setdefault(variant, {})[seed] = coverage_curve(found[variant, seed], grid, full)
-        unit = f"%; steps to 50, 90, 100 %: {', '.join(s or '-' for s in steps_to(times, full).values())}" if full else "units"
-        print(f"{variant:18} seed {seed}: {curves[variant][seed][-1]:6.1f} {unit}")
-    rows = [f"{v},{n},{x},{y:.4f}" for v, of in curves.items() for n, ys in of.items() for x, y in zip(grid, ys, strict=True)]
-    write_atomically(out / "curves.csv", lambda f: f.write("\n".join(["variant,seed,steps,coverage", *rows, ""]).encode()))
-    if not args.no_figures:
-        figures = {"curves.png": curves_figure(grid, curves, full, unit_name(env))}
-        if args.experiment == "methods":
-            shown = {variant: found[variant, best(of)] for variant, of in curves.items()}
-            figures["maps.png"] = maps_figure(level_drawing(env, set().union(*shown.values())),
-                                              {f"{v}: {len(d)} {unit_name(env)}": d for v, d in shown.items()}, int(grid[-1]))
-        save_figures(out, figures)
-    print(f"{out}: curves.csv{'' if args.no_figures else ', ' + ', '.join(figures)}")
+    found = {}
+    failed = []
+    for ((variant, seed), run), code in zip(runs.items(), codes, strict=True):
+        if code == 0:
+            discovered = read_checkpoint(pathlib.Path(run.out))["algorithm"]["discovered"]
+            found.setdefault(variant, {})[seed] = discovered
+        else:
+            failed.append(f"{run.out} (exit code {code})")
+    if found:
+        report(args, env, Config(**settings["config"]), found)
+    env.close()
+    if failed:
+        raise InputError(
+            f"failed, as their logs tell: {', '.join(failed)}; the same command tries these again"
+        )
     return 0
 
 
-def best(curves: dict[int, np.ndarray]) -> int:
-    """The seed whose coverage is highest at the end (S6.2-06)."""
-    return max(curves, key=lambda seed: curves[seed][-1])
+def check_same(run):
+    """Raise InputError where the folder of a run holds one of another configuration."""
+    if not (pathlib.Path(run.out) / "config.json").exists():
+        return
+    found = recorded_settings(run.out, parser().parse_args([]))
+    wanted = settings_of(run)
+    same_steps = found["config"]["steps"] == wanted["config"]["steps"]
+    if fixed(found) != fixed(wanted) or not same_steps:
+        raise InputError(f"{run.out} holds a run of another configuration: choose another --out")
 
 
-# ----------------------------------------------------------------------------------------------------- the command line
+def run_apart(command):
+    """Do a run in a process of its own, or what is left of it. Returns its exit code."""
+    process = multiprocessing.get_context("spawn").Process(target=run_into_log, args=(command,))
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def run_into_log(command):
+    """In a process of its own: the run, its output in a file beside its folder."""
+    end_with_parent()
+    folder = pathlib.Path(parser().parse_args(command).out)
+    if (folder / "config.json").exists():
+        command = ["--resume", str(folder), "--no-figures"]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        open(f"{folder}.log", "a", buffering=1) as log,
+        contextlib.redirect_stdout(log),
+        contextlib.redirect_stderr(log),
+    ):
+        sys.exit(main(command))
+
+
+def end_with_parent():
+    """End this process when the one that started it ends, also where that was killed."""
+
+    def watch():
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def report(args, env, config, found):
+    """Curves, figures, and a line for each run. found: variant -> seed -> first visits."""
+    folder = experiment_folder(args)
+    full = full_coverage(env)
+    grid = np.linspace(0, config.steps, 201).astype(int)
+    rows = ["variant,seed,steps,coverage"]
+    for variant, of_seed in found.items():
+        for seed, discovered in of_seed.items():
+            curve = coverage_curve(discovered, grid, full)
+            rows += [f"{variant},{seed},{x},{y:.4f}" for x, y in zip(grid, curve, strict=True)]
+            marks = f"% at the end; steps to {steps_to(discovered, full)}" if full else "units"
+            print(f"{variant:17} seed {seed}: {curve[-1]:6.1f} {marks}")
+    write_atomically(folder / "curves.csv", ("\n".join(rows) + "\n").encode())
+    if args.no_figures:
+        return
+    runs = {variant: list(of_seed.values()) for variant, of_seed in found.items()}
+    figures = {"curves.png": curves_figure(runs, env, config)}
+    if args.experiment == "methods":
+        maps = {f"{v}: {len(best(of))} {unit_name(env)}": best(of) for v, of in runs.items()}
+        level = Level(env, {unit for discovered in maps.values() for unit in discovered})
+        if level.boxes:
+            figures["maps.png"] = maps_figure(level, maps, config.steps)
+    print(f"{folder}: curves.csv, {', '.join(save_figures(folder, figures))}")
+
+
+def best(runs):
+    """Of a variant's runs the one that covers most at the end (S6.2-06)."""
+    return max(runs, key=len)
+
+
+def cores():
+    """How many cores this process may use."""
+    try:
+        allowed = len(os.sched_getaffinity(0))
+    except AttributeError:  # not every system has it
+        allowed = os.cpu_count() or 1
+    try:
+        quota, period = pathlib.Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        return max(1, min(allowed, int(quota) // int(period)))  # of a container
+    except (OSError, ValueError):
+        return allowed
+
+
+# --------------------------------------------------------------------------- the command line
 
 
 class Parser(argparse.ArgumentParser):
-    def error(self, message: str):
+    def error(self, message):
         raise InputError(f"{message}; --help lists the options")
 
 
-def parser() -> Parser:
-    p = Parser(prog="rbexplore.py", usage="rbexplore.py --env maze [options]", allow_abbrev=False,
-               description="Explore an environment by rolling back to stored states, clustered by a learned similarity: "
-                           "RbExplore (Ugadiarov, Skrynnik, Panov).")
-    p.add_argument("--env", help="environment: maze, pop or montezuma (default: maze)")
-    p.add_argument("--method", choices=METHODS, help="what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
-                   "actions; RbExplore with Go-Explore's cells in R's place, or exact states (default: rbexplore)")
-    p.add_argument("--experiment", choices=list(EXPERIMENTS), help="do all runs of figures 4 and 5 (6.2) or of figure 6 (6.3), "
-                   "and draw; --out is then the folder of their folders; the same command goes on where it was interrupted")
-    p.add_argument("--seeds", type=int, help="with --experiment: runs of each variant, from --seed on (default: 3)")
-    p.add_argument("--level", type=int, help="level: 1 to 3 of the maze, 1 to 14 of pop (default: 1)")
-    p.add_argument("--rom", help="pop: the NES cartridge's file, which you bring")
-    p.add_argument("--state", help="pop: a start state, gzip of the emulator's; without it the cartridge boots")
-    p.add_argument("--config", choices=list(CONFIGS), help="values of all fields below (default: maze for maze, else paper)")
-    p.add_argument("--out", help="run folder (default: runs/<env>-<seed>)")
-    p.add_argument("--resume", metavar="RUN", help="go on with the run in this folder; its options come from there")
-    p.add_argument("--verify", metavar="RUN", help="check that every cluster of this run is reached exactly, both by replaying "
-                   "its actions and by its snapshot; exit code 1 if one is not")
-    p.add_argument("--export-demos", metavar="FILE", help="with --verify: write the actions to each cluster to FILE (npz)")
-    p.add_argument("--device", help="where the networks are: cpu, cuda, cuda:1, ... (default: cpu)")
-    p.add_argument("--threads", type=int, help="of the networks' arithmetic; another number, other roundings (default: 1)")
-    p.add_argument("--workers", type=int, help="processes that run trajectories; any number, same result (default: 1)")
-    p.add_argument("--trace", action="store_true", help="write every decision to trace.jsonl")
-    p.add_argument("--no-figures", action="store_true", help="draw none")
-    p.add_argument("--profile", action="store_true", help="print where the time went")
-    for kind, configs, title in ((Config, CONFIGS, "fields of the configuration"), (PPOConfig, PPO_CONFIGS, "of PPO")):
-        group = p.add_argument_group(title, "In brackets: paper | maze; then the section, the reading or the source.")
-        for f in fields(kind):
-            flag, values = "--" + f.name.replace("_", "-"), [getattr(c, f.name) for c in configs.values()]
-            text = f"[{' | '.join(map(str, dict.fromkeys(values)))}] {f.metadata['meaning']}"
-            form = {"action": argparse.BooleanOptionalAction} if f.type is bool else {"type": f.type, "metavar": f.type.__name__}
-            group.add_argument(flag, default=None, help=text.replace("%", "%%"), **form)
+def parser():
+    p = Parser(
+        prog="rbexplore.py",
+        allow_abbrev=False,
+        description="RbExplore (Ugadiarov, Skrynnik, Panov): explore an environment by rolling "
+        "back to stored states, clustered by a learned similarity.",
+        epilog="example: python rbexplore.py --env maze --level 2 --seed 1 --out runs/second",
+    )
+
+    def add(name, meaning, **form):
+        p.add_argument(name, help=meaning, **form)
+
+    flag = {"action": "store_true", "default": None}
+    add("--env", "maze, pop (Prince of Persia) or montezuma (default: maze)")
+    add("--level", "1 to 3 of the maze, 1 to 14 of pop (default: 1)", type=int)
+    add("--rom", "pop: the NES cartridge's file, which you bring")
+    add("--state", "pop: a start state, gzip of the emulator's")
+    add(
+        "--method",
+        "what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
+        "actions; RbExplore with Go-Explore's cells for R (default: rbexplore)",
+        choices=METHODS,
+    )
+    add(
+        "--config",
+        "values of the fields below (default: maze for the maze, else paper)",
+        choices=list(CONFIGS),
+    )
+    add("--out", "run folder (default: runs/<env>-<seed>)", metavar="RUN")
+    add("--resume", "go on with the run in this folder; with --steps beyond its end", metavar="RUN")
+    add(
+        "--verify",
+        "check that each cluster of this run is reached exactly, by its actions and by "
+        "its snapshot; exit code 1 if one is not",
+        metavar="RUN",
+    )
+    add(
+        "--experiment",
+        "do all runs of figures 4 and 5 (6.2) or 6 (6.3), or go on with them",
+        choices=list(EXPERIMENTS),
+    )
+    add("--seeds", "with --experiment: runs of each variant, from --seed on (default: 3)", type=int)
+    add("--stop-at-full", "end as soon as all is covered", **flag)
+    add("--trace", "write what each iteration did to trace.jsonl", **flag)
+    add("--no-figures", "draw none", **flag)
+    add("--workers", "processes that walk; any number, same result (default: 1)", type=int)
+    add("--threads", "of the arithmetic; another number, other roundings (default: 1)", type=int)
+    add("--device", "where the networks are: cpu, cuda, cuda:1, ... (default: cpu)")
+    group = p.add_argument_group("configuration", "In brackets the paper's value | the maze's.")
+    for f in fields(Config):
+        values = dict.fromkeys(str(getattr(config, f.name)) for config in CONFIGS.values())
+        form = {"type": f.type, "metavar": f.type.__name__}
+        if f.type is bool:
+            form = {"action": argparse.BooleanOptionalAction}
+        meaning = f"[{' | '.join(values)}] {f.metadata['meaning']}"
+        group.add_argument("--" + f.name.replace("_", "-"), default=None, help=meaning, **form)
     return p
 
 
-def settings_of(args: argparse.Namespace) -> dict:
-    """What makes the run, from the command line: all of it goes to config.json."""
-    env, method = args.env or "maze", args.method or "rbexplore"
-    base = args.config or ("maze" if env == "maze" else "paper")
-    given, ppo = ({f.name: getattr(args, f.name) for f in fields(kind) if getattr(args, f.name) is not None}
-                  for kind in (Config, PPOConfig))
-    config = config_of(method, CONFIGS[base], **given)
-    paths = {name: getattr(args, name) and os.path.abspath(getattr(args, name)) for name in ("rom", "state")}
-    options = {name: value for name, value in ({"level": args.level} | paths).items() if value is not None}
-    for name in ("threads", "workers"):
-        if getattr(args, name) is not None and not 1 <= getattr(args, name) <= 1000:
-            raise InputError(f"{name} is {getattr(args, name)}: give a number from 1 to 1,000")
-    return {"method": method, "ppo": asdict(replace(PPO_CONFIGS[base], **ppo)), "env": env,
-            "options": options | {"frame_size": config.frame_size}, "config": asdict(config), "device": args.device or "cpu",
-            "threads": args.threads or 1, "workers": args.workers or 1, "versions": versions()}
-
-
-def versions() -> dict[str, str]:
-    return {"python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__,
-            "gymnasium": gymnasium.__version__}
-
-
-def recorded_settings(folder: str, args: argparse.Namespace) -> dict:
-    """The settings of the run in the folder; what else is on the command line must agree with them."""
-    path = pathlib.Path(folder) / "config.json"
-    try:
-        settings = json.loads(path.read_text())
-        fixed = {"level": 1, "rom": None, "state": None, "out": folder} | settings["options"] | settings["config"]
-        fixed |= settings["ppo"] | {name: settings[name] for name in ("method", "env", "device", "threads")}
-        recorded = settings["workers"], settings["versions"]
-        if not all(isinstance(settings[name], int) and settings[name] > 0 for name in ("threads", "workers")):
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        raise InputError(f"{path} cannot be read: there is no run in {folder}; see what --out was") from None
-    if args.config:
-        raise InputError("--config goes with a new run: a resumed run keeps its options; leave it out")
-    settings["workers"] = args.workers or recorded[0]  # any number gives the same result
-    if args.verify and args.device:
-        settings["device"] = fixed["device"] = args.device
-    if recorded[1] != versions():
-        print(f"note: {folder} was begun with {recorded[1]}, this is {versions()}: the result may differ in the last digits")
-    for name, value in vars(args).items():
-        value = os.path.abspath(value) if name in ("rom", "state") and value else value
-        if name in fixed and value is not None and value != fixed[name]:
-            raise InputError(f"--{name.replace('_', '-')} {value} differs from {fixed[name]} in {path}: a resumed run keeps "
-                             "its options; leave it out, or begin anew with another --out")
+def settings_of(args):
+    """What makes a run, and what is good to know of it: for config.json."""
+    env = args.env or "maze"
+    given = {f.name: getattr(args, f.name) for f in fields(Config)}
+    given = {name: value for name, value in given.items() if value is not None}
+    base = CONFIGS[args.config or ("maze" if env == "maze" else "paper")]
+    method = args.method or "rbexplore"
+    if method != "rbexplore":  # no R is learned, so nothing is spent on what serves it alone
+        given |= {"pretrain_steps": 0, "L": 0}
+    settings = {
+        "method": method,
+        "env": env,
+        "level": args.level,
+        "rom": absolute(args.rom),
+        "state": absolute(args.state),
+        "config": asdict(replace(base, **given)),
+        "device": args.device or "cpu",
+        "threads": 1 if args.threads is None else args.threads,
+        "workers": 1 if args.workers is None else args.workers,
+        "versions": versions(),
+    }
+    check_counts(settings)
     return settings
 
 
-def prepare(settings: dict):
-    """Check the device, fix threads and determinism; return the algorithm and its executor."""
+def check_counts(settings):
+    for name in ("threads", "workers"):
+        value = settings[name]
+        if not isinstance(value, int) or not 1 <= value <= 1000:
+            raise InputError(f"{name} is {value}: give a number from 1 to 1,000")
+
+
+def absolute(path):
+    return path and os.path.abspath(path)
+
+
+def options_of(settings):
+    """The options with which the environment is made."""
+    options = {name: settings[name] for name in ("level", "rom", "state")}
+    options["frame_size"] = settings["config"]["frame_size"]
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def versions():
+    return {
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "numpy": np.__version__,
+        "gymnasium": gymnasium.__version__,
+    }
+
+
+def recorded_settings(folder, args):
+    """The settings of the run in the folder; of the command line what cannot change its result."""
+    may_change = ["resume", "verify", "workers", "rom", "state", "no_figures"]
+    may_change += ["device"] if args.verify else ["steps", "stop_at_full"]
+    for name, value in vars(args).items():
+        if value is not None and name not in may_change:
+            raise InputError(
+                f"--{name.replace('_', '-')} does not go with a run that was begun: "
+                "leave it out, or begin anew with another --out"
+            )
+    path = pathlib.Path(folder) / "config.json"
+    try:
+        settings = json.loads(path.read_text())
+        steps = Config(**settings["config"]).steps
+        if settings.keys() != settings_of(parser().parse_args([])).keys():
+            raise KeyError("settings")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"{path} cannot be used ({type(error).__name__}): there is no run in "
+            f"{folder}, or it is damaged, or of another version"
+        ) from None
+    if settings["versions"] != versions():
+        print(
+            f"note: {folder} was begun with {settings['versions']}, and this is {versions()}: "
+            "the result may differ in the last digits"
+        )
+    if args.steps is not None and args.steps < steps:
+        raise InputError(f"steps is {args.steps}: a run is extended, not cut; give {steps} or more")
+    settings["config"]["steps"] = args.steps or steps
+    settings["rom"] = absolute(args.rom) or settings["rom"]
+    settings["state"] = absolute(args.state) or settings["state"]
+    settings["device"] = args.device or settings["device"]
+    if args.workers is not None:
+        settings["workers"] = args.workers
+    check_counts(settings)
+    return settings
+
+
+def prepare(settings):
+    """Fix threads and determinism. Returns the algorithm, and the executor of its workers, if
+    any."""
     torch.set_num_threads(settings["threads"])
     torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # nothing here reads such memory, and filling it takes time
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS wants for that
-    torch.backends.cudnn.allow_tf32 = False  # whose rounding would hide that two embeddings are of equal frames (R29)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # nothing here reads any
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS wants it for that
     try:
         torch.zeros(1, device=settings["device"]).cpu()
     except (RuntimeError, AssertionError, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
-        raise InputError(f"device {settings['device']} cannot be used ({reason}): give another --device, such as cpu") from None
-    try:
-        config, ppo = Config(**settings["config"]), PPOConfig(**settings["ppo"])
-    except TypeError as error:
-        raise InputError(f"the configuration in config.json does not fit this version: {error}") from None
+        raise InputError(
+            f"device {settings['device']} cannot be used ({reason}): give another "
+            "--device, such as cpu"
+        ) from None
     executor = None
     if settings["workers"] > 1:
-        executor = ProcessPoolExecutor(settings["workers"], multiprocessing.get_context("spawn"), signal.signal,
-                                       (signal.SIGINT, signal.SIG_IGN))
-    env_fn = functools.partial(make_env, settings["env"], **settings["options"])
-    return make_method(settings["method"], env_fn, config, settings["device"], executor, ppo), executor
+        context = multiprocessing.get_context("spawn")
+        executor = ProcessPoolExecutor(settings["workers"], context, initializer=end_with_parent)
+    env_fn = functools.partial(make_env, settings["env"], **options_of(settings))
+    config = Config(**settings["config"])
+    algorithm = make_method(settings["method"], env_fn, config, settings["device"], executor)
+    return algorithm, executor
 
 
-def main(argv: list[str] | None = None) -> int:
-    """The command line. Returns the exit code: 0; 2 for an error that the user can put right; 130 after Ctrl-C."""
+def main(argv=None):
+    """The command line. Returns the exit code: 0; 1 where --verify finds a difference; 2 for what
+    the user can put right; 130 after Ctrl-C."""
     try:
         return command(parser().parse_args(argv))
-    except (InputError, FloatingPointError) as error:
-        print(f"rbexplore: {error}", file=sys.stderr)
-        return 2
+    except InputError as error:
+        problem = str(error)
     except OSError as error:
         place = error.filename or "a file"  # a full disk names none
-        print(f"rbexplore: {place} cannot be written: {error.strerror}; make room, or choose another place", file=sys.stderr)
-        return 2
+        problem = f"{place} cannot be written: {error.strerror}; make room, or choose another place"
     except BrokenProcessPool:
-        print("rbexplore: a worker process died, of memory perhaps: go on with --resume and fewer --workers", file=sys.stderr)
-        return 2
+        problem = "a worker process died, of memory perhaps: --resume with fewer --workers"
     except MemoryError:
-        print("rbexplore: out of memory: give smaller values, of M, frame_size or actors for example", file=sys.stderr)
-        return 2
+        problem = "out of memory: give smaller values, of M, L or trajectory_steps for example"
     except KeyboardInterrupt:
         return 130
+    print(f"rbexplore: {problem}", file=sys.stderr)
+    return 2
 
 
-def command(args: argparse.Namespace) -> int:
+def command(args):
+    """Do what the options say. Returns the exit code."""
+    check_options(args)
+    if args.experiment:
+        return experiment(args)
+    if args.verify:
+        return verified(args)
+    settings = recorded_settings(args.resume, args) if args.resume else settings_of(args)
+    folder = args.resume or args.out or f"runs/{settings['env']}-{settings['config']['seed']}"
+    algorithm, executor = prepare(settings)
+    try:
+        run = Run(folder, algorithm, settings, bool(args.trace))
+        if args.resume:
+            run.resume()
+        else:
+            run.begin()
+        complete = run.go(args.stop_at_full)
+        print(run.summary())
+        if not args.no_figures:
+            print(draw(run))
+        run.lock.release()
+    finally:
+        algorithm.env.close()
+        if executor:
+            executor.shutdown(cancel_futures=True)
+    if complete:
+        return 0
+    print(f"go on with: python rbexplore.py --resume {folder}")
+    return 130
+
+
+def check_options(args):
+    """Raise InputError for options that are empty or do not go together."""
     for name, value in vars(args).items():
         if value == "":
             raise InputError(f"--{name.replace('_', '-')} is empty: give a value, or leave it out")
     if sum(map(bool, (args.experiment, args.resume, args.verify))) > 1:
         raise InputError("--experiment, --resume and --verify exclude each other: give one of them")
-    if args.export_demos and not (args.verify and args.export_demos.endswith(".npz")):
-        raise InputError("--export-demos goes with --verify RUN, and FILE ends in .npz")
     if args.seeds is not None and not (args.experiment and args.seeds > 0):
         raise InputError(f"seeds is {args.seeds}: give 1 or more, with --experiment")
-    if args.experiment and args.method:
-        raise InputError("--experiment chooses the methods: leave --method out")
-    if args.experiment and (args.trace or args.profile):
-        raise InputError("--trace and --profile go with a single run, not with --experiment: leave them out")
+    if args.experiment and (args.method or args.trace or args.stop_at_full):
+        raise InputError(
+            "--experiment chooses the methods and does whole runs: leave --method, "
+            "--trace and --stop-at-full out"
+        )
     if not args.no_figures and not args.verify:
-        new_figure(1, 1)  # so that a missing matplotlib shows now and not at the end
-    if args.experiment:
-        return experiment(args)
-    old = args.resume or args.verify
-    settings = recorded_settings(old, args) if old else settings_of(args)
-    started = time.monotonic()
-    algorithm, executor = prepare(settings)
-    folder = pathlib.Path(old or args.out or f"runs/{settings['env']}-{settings['config']['seed']}")
-    run = Run(folder, settings, algorithm, args.trace or bool(old) and (folder / "trace.jsonl").exists())
-    if args.verify:
-        return verified(run, args.export_demos)
-    profile = Profile(algorithm, run) if args.profile else None  # which may refuse, before there is a folder
-    run.resume() if args.resume else run.create()
-    print(header(run))
-    stopped = False
-    try:
-        algorithm.run()
-    except KeyboardInterrupt:
-        stopped = True
-        print("\nstopped: going back to the last complete iteration", flush=True)
-        run.resume()
-    finally:
-        if executor:
-            executor.shutdown(cancel_futures=True)
-    figures = [] if args.no_figures else draw_figures(run)
-    print(summary(run, figures, time.monotonic() - started, stopped))
-    if profile:
-        print(profile.table(time.monotonic() - started))
-    return 130 if stopped else 0
+        new_figure(1, 1)  # so that a missing matplotlib shows now, and not at the end
 
 
-def verified(run: Run, demos: str | None) -> int:
-    if isinstance(run.algorithm, Baseline):
-        raise InputError(f"{run.folder} is a run of {run.settings['method']}, which has no clusters to verify")
-    run.load()
-    table, good = verify(run.algorithm)
+def verified(args):
+    """Check the run in a folder. Returns the exit code."""
+    settings = recorded_settings(args.verify, args)
+    if settings["method"] not in ("rbexplore", "cells"):
+        raise InputError(f"{args.verify} is a run of {settings['method']}, which has no clusters")
+    algorithm, _ = prepare(settings | {"workers": 1})
+    Run(args.verify, algorithm, settings).load()
+    table, good = verify(algorithm)
+    algorithm.env.close()
     print(table)
-    if demos:
-        export_demos(run.algorithm, pathlib.Path(demos))
-        print(f"demonstrations: {demos}")
     return 0 if good else 1
-
-
-def header(run: Run) -> str:
-    s, c, a = run.settings, run.settings["config"], run.algorithm
-    full = getattr(a.env, "full_coverage", None)
-    level = f", level {s['options'].get('level', 1)}" if s["env"] != "montezuma" else ""
-    units = f"{full} {unit_name(a.env)} to cover" if full else f"full coverage in {unit_name(a.env)} is not known"
-    begin = f", from step {a.steps:,} on" if a.steps else ""
-    return (f"{s['method']} on {s['env']}{level}: {units}; seed {c['seed']}; {c['steps']:,} steps, {c['pretrain_steps']:,} "
-            f"of them pretraining{begin}\n{s['device']}, {s['threads']} thread(s), {s['workers']} worker(s), "
-            f"torch {torch.__version__}; run folder {run.folder}\n"
-            + " ".join(f"{heading:>{width}}" for heading, width, *_ in Run.COLUMNS) + "    left")
-
-
-def summary(run: Run, figures: list[str], seconds: float, stopped: bool) -> str:
-    a, full = run.algorithm, getattr(run.algorithm.env, "full_coverage", None)
-    times = sorted(a.discovered.values())
-    lines = [f"{'stopped' if stopped else 'done'} after {a.steps:,} steps and {seconds:.0f} s: {len(times)} "
-             f"{f'of {full} ' if full else ''}{unit_name(a.env)}{f' ({100 * len(times) / full:.1f} %)' if full else ''}"]
-    if not isinstance(a, Baseline):
-        lines[0] += f", {len(a.graph.clusters)} clusters"
-    if full:
-        marks = steps_to(times, full).items()
-        lines.append("steps to " + ", ".join(f"{share} %: {step or 'not reached'}" for share, step in marks))
-    if resource:
-        unit = 2**30 if sys.platform == "darwin" else 2**20  # it counts bytes there, elsewhere kilobytes
-        lines[0] += f", peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit:.2f} GiB"
-    lines.append(f"{run.folder}: config.json, metrics.csv, checkpoint.pt{', ' if figures else ''}{', '.join(figures)}")
-    if stopped:
-        lines.append(f"go on with: python rbexplore.py --resume {run.folder}")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":
