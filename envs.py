@@ -43,8 +43,9 @@ class PersistentEnv(gymnasium.Env):
     from ever later states. The configuration sets the length of a trajectory. A counter outside
     the snapshot breaks the replay, so there should be none at all.
 
-    Snapshots are held by the thousand: an iteration holds M x trajectory_steps of them, which at
-    1 MB each and with the paper's numbers makes 45 GB. Keep them small.
+    Snapshots are held by the thousand: an iteration holds one for each of its states, which at
+    1 MB each and with the paper's numbers makes 95 GB (M x trajectory_steps and L x
+    additional_steps). Keep them small.
     """
 
     full_coverage: int | None = None  # number of units of full coverage (5), None if unknown

@@ -215,7 +215,7 @@ class RbExplore:
         rnd_loss = self.train_novelty(trajectories, rng_5)
 
         novelty = np.concatenate([tau.novelty for tau in trajectories])
-        metrics = {
+        metrics = {  # a new entry becomes a column of metrics.csv
             **progress_metrics(self),
             "theta_sim": theta_sim,
             "clusters": len(self.graph.clusters),
@@ -254,7 +254,7 @@ class RbExplore:
         Clusters are drawn with replacement, as G begins with a single one (R12)."""
         clusters, probabilities = self.graph.sampling_distribution()
         sampled = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
-        centres = [self.graph.clusters[v] for v in sampled]
+        centres = [self.graph.centre(v) for v in sampled]
         covers = not self.pretraining
         trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
         for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the budget ended
@@ -382,7 +382,8 @@ class Trajectory:
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
     ended: bool  # by the environment, and not by the number of steps
     start: int = 0  # the cluster it began from; an additional one: its exploration began from
-    prefix: list[np.ndarray] = field(default_factory=list)  # the full prefix s_init ... s_1
+    # The full prefix s_init ... s_1, states; empty where it began at the initial cluster.
+    prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
     clusters: list[int] = field(default_factory=list)  # T; the cluster of each state, from step 4
 
@@ -567,13 +568,12 @@ class SimilarityModel(nn.Module):
         last; None where there are no pairs of both classes."""
         losses = []
         self.train()
-        for _ in range(self.epochs):
-            chosen = balanced(pairs, rng)
-            losses = [
-                self.update(*stack(batch))
-                for batch in progress(batches(chosen, self.batch_size), "train R")
-            ]
-        self.eval()
+        try:
+            for _ in range(self.epochs):
+                shuffled = batches(balanced(pairs, rng), self.batch_size)
+                losses = [self.update(*stack(batch)) for batch in progress(shuffled, "train R")]
+        finally:
+            self.eval()  # also after Ctrl-C
         return float(np.mean(losses)) if losses else None
 
     def update(self, s_1, s_2, y):
@@ -639,6 +639,10 @@ class Graph:
         """sigma: the clusters, each with a probability inverse to its visits (6.1; S4.2-12)."""
         weights = np.array([1 / v.visits for v in self.clusters.values()])
         return list(self.clusters), weights / weights.sum()
+
+    def centre(self, v):
+        """The state of a cluster alone, without what G knows of it: it may travel to a worker."""
+        return State(self.clusters[v].frame, self.clusters[v].snapshot)
 
     def embed_centres(self, similarity):
         """Embed all centres by the R of now (S4-03)."""
@@ -833,8 +837,9 @@ class RND(nn.Module):
         return (self.errors(frames) - recent.mean()) / (recent.std() + 1e-8)
 
     def fit(self, trajectories, rng):
-        """Update the normalisers, then train the predictor, one pass over all states of
-        trajectories (T, H, W). Returns the mean loss."""
+        """Update the pixels' statistics, train the predictor, one pass over all states of
+        trajectories (T, H, W), and keep the errors that it then has, by which the next iterations'
+        rewards are scaled. Returns the mean loss."""
         for frames in trajectories:
             self.pixels.update(frames)
         states = [frame for frames in trajectories for frame in frames]
@@ -1515,8 +1520,9 @@ class Run:
             value = row.get(name)
             cell = "-" if value is None else format(value, form)
             cells.append(f"{cell:>{width}}")
-        recent = self.rows[-6:]
-        pace = sum(r["seconds"] for r in recent[1:]) / max(1, row["steps"] - recent[0]["steps"])
+        recent = self.rows[-5:]
+        steps_before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
+        pace = sum(r["seconds"] for r in recent) / max(1, row["steps"] - steps_before)
         left = round(pace * (self.algorithm.config.steps - row["steps"]))
         cells.append(f"{left // 60:4}:{left % 60:02}")
         for name, finds in (("r_tpr", "new"), ("r_tnr", "known")):
@@ -1598,8 +1604,8 @@ def read_checkpoint(folder):
 def damaged(folder, error):
     path = folder / "checkpoint.pt"
     return InputError(
-        f"{path} cannot be loaded ({type(error).__name__}): it is missing or "
-        "damaged; begin anew with another --out"
+        f"{path} cannot be loaded ({type(error).__name__}): it is missing, "
+        "damaged, or of another version; begin anew with another --out"
     )
 
 
@@ -1810,7 +1816,7 @@ def curves_figure(runs, env, config):
     panel.set_xlabel("agent steps (exploration, additional, pretraining)")
     panel.set_ylabel(f"coverage, % of {full} {unit_name(env)}" if full else unit_name(env))
     panel.set(xlim=(0, config.steps), ylim=(0, 102 if full else None))
-    panel.legend()
+    panel.legend(loc="lower right")
     return figure
 
 
@@ -1863,9 +1869,9 @@ def graph_figure(graph, level, places):
     busiest = max(graph.arcs.values(), default=1)
     for (start, end), visits in graph.arcs.items():
         if start in at and end in at:
-            share = math.log1p(visits) / math.log1p(busiest)
+            share = math.sqrt(visits / busiest)  # most arcs are rare: they must not hide the others
             xs, ys = zip(at[start], at[end], strict=True)
-            panel.plot(xs, ys, color="white", alpha=0.1 + 0.6 * share, linewidth=0.3 + 2 * share)
+            panel.plot(xs, ys, color="white", alpha=0.04 + 0.8 * share, linewidth=0.3 + 2 * share)
     most = max(v.visits for v in graph.clusters.values())
     sizes = [12 + 300 * graph.clusters[v].visits / most for v in at]
     xs, ys = zip(*at.values(), strict=True)
