@@ -1959,7 +1959,8 @@ def experiment(args):
     settings = settings_of(next(iter(runs.values())))
     env = make_env(settings["env"], **options_of(settings))  # its errors show before any run
     side_by_side = max(1, cores() // (settings["workers"] * settings["threads"]))
-    print(f"{len(runs)} runs, {side_by_side} at a time; the log of each is beside its folder")
+    where = f"in {experiment_folder(args)}, the log of each beside its folder"
+    print(f"{len(runs)} runs, {side_by_side} at a time, {where}", flush=True)
     with ThreadPoolExecutor(side_by_side) as pool:
         jobs = [pool.submit(run_apart, command) for command in runs_of(args).values()]
         try:
@@ -2003,6 +2004,8 @@ def run_apart(command):
     process = multiprocessing.get_context("spawn").Process(target=run_into_log, args=(command,))
     process.start()
     process.join()
+    word = "done" if process.exitcode == 0 else "failed"
+    print(f"{parser().parse_args(command).out}: {word}", flush=True)
     return process.exitcode
 
 

@@ -2873,6 +2873,27 @@ def test_S3_2_03_verify_finds_a_cluster_that_is_not_reached(finished, tmp_path, 
     assert (folder / "checkpoint.pt").read_bytes() == before
 
 
+@pytest.mark.parametrize("name", ["pop", "montezuma"])
+def test_S3_2_03_a_run_in_an_emulator_is_exact_with_workers_and_after_its_cartridge_moved(
+    rom, tmp_path, capsys, name
+):
+    folder = tmp_path / "run"
+    cartridge = [f"--rom={rom}"] if name == "pop" else []
+    sizes = ["--M=2", "--L=2", "--trajectory-steps=20", "--frame-size=32", "--no-figures"]
+    steps = ["--steps=200", "--pretrain-steps=60", "--theta-sim=0.9", "--workers=2"]
+    argv = [f"--env={name}", "--config=maze", *cartridge, *sizes, *steps, f"--out={folder}"]
+    assert main(argv) == 0
+    if name == "pop":
+        os.rename(rom, tmp_path / "moved.nes")
+        refused(capsys, ["--verify", folder], "cannot read the cartridge")
+        cartridge = [f"--rom={tmp_path / 'moved.nes'}"]
+    resume = ["--resume", str(folder), "--steps=260", "--workers=1", "--no-figures"]
+    assert main([*resume, *cartridge]) == 0
+    assert main(["--verify", str(folder), *cartridge]) == 0
+    clusters = len(rbexplore.read_checkpoint(folder)["algorithm"]["graph"]["clusters"])
+    assert f"{clusters} of {clusters} clusters" in capsys.readouterr().out and clusters > 2
+
+
 @pytest.mark.parametrize(("damage", "said"), [
     ("checkpoint.pt cut", "checkpoint.pt cannot be loaded.*another --out"),
     ("checkpoint.pt gone", "checkpoint.pt cannot be loaded"),
@@ -3084,6 +3105,7 @@ def test_an_experiment_does_the_rest_names_failures_and_goes_on(tmp_path, capsys
         capsys, argv, "failed, as their logs tell: .*no-merge-0 .exit code 2.; the same command"
     )
     assert "rbexplore         seed 0:" in out and "no-prefix" in out and "curves.png" in out
+    assert f"{tmp_path}/rbexplore-0: done" in out and f"{tmp_path}/no-merge-0: failed" in out
     assert "not empty" in (tmp_path / "no-merge-0.log").read_text()
     (broken / "mine").unlink()
     first = outcome(tmp_path / "rbexplore-0")
