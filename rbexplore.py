@@ -1403,6 +1403,8 @@ class Run:
         self.own()
         check_unused(self.folder)  # again, now that nobody else can begin in it
         self.write_settings()
+        if self.trace:
+            (self.folder / "trace.jsonl").touch()
         self.save()
         return self
 
@@ -1410,8 +1412,8 @@ class Run:
         """Go on from the last complete iteration; what came after it is forgotten. Returns the
         run."""
         self.own()
-        self.write_settings()
-        if (self.folder / "metrics.csv").exists():  # else it was stopped as soon as it had begun
+        saved = [self.folder / "checkpoint.pt", self.folder / "metrics.csv"]
+        if any(path.exists() for path in saved):  # else it was stopped as soon as it had begun
             self.load()
         trace = self.folder / "trace.jsonl"
         size = trace.stat().st_size if trace.exists() else 0
@@ -1420,9 +1422,10 @@ class Run:
                 f"{trace} is missing or cut short: put the whole file back, or begin "
                 "anew with another --out"
             )
-        if self.trace_bytes > 0:
+        if trace.exists():
             self.trace = True
             os.truncate(trace, self.trace_bytes)
+        self.write_settings()
         self.save()
         return self
 

@@ -2778,6 +2778,22 @@ def test_a_run_killed_at_any_write_can_be_resumed_or_begun(finished, tmp_path, m
         assert rows_of(folder)[:3] == rows_of(finished[0])[:3]
 
 
+def test_a_resumed_run_writes_what_is_missing_and_keeps_its_trace(finished, tmp_path):
+    folder = tmp_path / "run"
+    argv = [*SMALL_RUN, "--steps=300", "--pretrain-steps=250", "--no-figures", f"--out={folder}"]
+    assert main([*argv, "--trace"]) == 0
+    before = outcome(folder)
+    (folder / "metrics.csv").unlink()
+    with open(folder / "trace.jsonl", "a") as file:
+        file.write("half a li")  # of an iteration that was not complete
+    assert main(["--resume", str(folder), "--no-figures"]) == 0
+    assert outcome(folder) == before and before[1]
+    (folder / "checkpoint.pt").unlink()
+    (folder / "metrics.csv").unlink()  # killed as soon as it had begun
+    assert main(["--resume", str(folder), "--no-figures"]) == 0
+    assert outcome(folder) == before
+
+
 def test_ctrl_c_exits_with_130_draws_and_can_be_resumed(finished, tmp_path):
     folder = tmp_path / "stopped"
     with start(*SMALL_RUN, "--trace", f"--out={folder}") as process:
