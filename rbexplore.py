@@ -82,7 +82,7 @@ class Config:
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
     L: int = option(1000, "novel states to walk on from, at most, an iteration (6.1)", 0)
     additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
-    beta: float = option(2.5, "a state is novel above it, in standard deviations (6.1, R4)")
+    beta: float = option(2.5, "a state is novel above it: deviations over the mean (6.1, R4)")
     n: int = option(5, "pairs closer than this are similar, steps (6.1)", 1)
     N: int = option(25, "pairs further apart than this are dissimilar, steps (6.1)", 1)
     prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
@@ -302,7 +302,8 @@ class RbExplore:
     def walk_on_from_novel_states(self, trajectories, rng):
         """Put the novel states into B, sample L of them, walk on from these (S4.2-15 ... S4.2-18).
 
-        B holds the novel states of this iteration only (R5). The walks serve R alone."""
+        Novel is told by the RND of the iteration before. B holds the novel states of this one only
+        (R5). The walks serve R alone."""
         B = []  # a novel state: its trajectory, and its index there
         for tau in trajectories:
             tau.novelty = self.novelty.reward(tau.frames)
@@ -812,7 +813,7 @@ class RND(nn.Module):
         self.to(device)
         self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.learning_rate)
         self.pixels = RunningMeanStd(shape=shape)  # over all states trained on
-        self.recent_errors = deque(maxlen=5)  # one entry an iteration (R4)
+        self.recent_errors = deque(maxlen=5)  # one entry an iteration (R4); empty: untrained
 
     def forward(self, frames):
         """Frames (B, H, W) -> the predictor's mean squared errors (B,), on observations
@@ -1025,6 +1026,7 @@ def progress_metrics(algorithm):
 
 
 def statistics_state(statistics):
+    """A RunningMeanStd, for a checkpoint."""
     return {
         "mean": torch.as_tensor(statistics.mean),
         "var": torch.as_tensor(statistics.var),
