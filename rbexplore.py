@@ -71,7 +71,8 @@ def option(default, meaning, low=-math.inf, high=math.inf):
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's configuration: the defaults are its values, the same for every level.
+    """The paper's configuration: the defaults are its values, where it gives them, else those of
+    our readings; the same for every level.
 
     Raises InputError for a value that cannot work."""
 
@@ -92,7 +93,9 @@ class Config:
     merge: bool = option(True, "merge clusters (4.2; off: ablation of 6.3)")
     merge_every: int = option(15, "iterations from one merge to the next (6.1, R28)", 1)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
-    small_networks: bool = option(False, "small encoders for R and RND, not ResNet-18 (6.1)")
+    small_networks: bool = option(
+        False, "small encoders: not ResNet-18 for R (6.1), not Burda's for RND"
+    )
     embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
     head_width: int = option(512, "width of fully connected layers (R20)", 1)
     learning_rate: float = option(1e-4, "Adam's (R18)", 0)
@@ -202,7 +205,8 @@ class RbExplore:
         if self.pretraining and self.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
-        # Made anew each iteration, so that a checkpoint needs none; one for each step that draws.
+        # Made anew each iteration, so that a checkpoint needs no generator; one for each step that
+        # draws, so that what one draws does not shift the next.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
         theta_sim = self.theta_sim()
@@ -266,8 +270,9 @@ class RbExplore:
     def collect(self, starts, steps, covers, rng):
         """Roll back to each state and walk at most `steps` steps.
 
-        Each step counts, whatever it serves (R2), and none is taken beyond the budget (S6.2-04), so
-        there may be fewer trajectories. covers: whether its steps count for coverage (R25)."""
+        Each step counts, whatever it serves (R2), and none is taken beyond the end of pretraining
+        or of the budget (S6.2-04), so there may be fewer trajectories then. covers: whether its
+        steps count for coverage (R25)."""
         end = self.config.pretrain_steps if self.pretraining else self.config.steps
         seeds = rng.integers(2**63, size=len(starts)).tolist()
         jobs = list(zip(starts, seeds, strict=True))
@@ -275,9 +280,9 @@ class RbExplore:
         bar = progress(total=len(jobs), what="walk")
         while len(trajectories) < len(jobs) and self.steps < end:
             left = end - self.steps
-            surely = max(1, left // steps)  # so many fit into the budget, however long they get
-            batch = jobs[len(trajectories) :][:surely]
-            for tau in walks(self, batch, min(steps, left)):
+            fitting = max(1, left // steps)  # walks that fit, if each takes all its steps
+            batch = jobs[len(trajectories) :][:fitting]
+            for tau in walk_all(self, batch, min(steps, left)):
                 for unit in tau.units:
                     self.steps += 1
                     if covers and unit is not None:
@@ -313,7 +318,7 @@ class RbExplore:
         additional = self.collect(novel_states, self.config.additional_steps, False, rng)
         for walked, (tau, i) in zip(additional, sample, strict=False):  # fewer, as in `explore`
             walked.start = tau.start
-            # The full prefix goes on from tau's, along tau, to the novel state (R29).
+            # The full prefix goes on from tau's, which ends with its s_1, to the novel state (R29).
             walked.prefix = tau.prefix[:-1] + list(tau.frames[: i + 1])
         return additional
 
@@ -345,7 +350,7 @@ class RbExplore:
             "pretraining": self.pretraining,
             "iteration": self.iteration,
             "steps": self.steps,
-            "discovered": self.discovered,
+            "discovered": dict(self.discovered),
             "similarity": self.similarity.state_dict(),
             "novelty": self.novelty.state_dict(),
             "graph": self.graph.state_dict(),
@@ -356,7 +361,7 @@ class RbExplore:
         self.pretraining = state["pretraining"]
         self.iteration = state["iteration"]
         self.steps = state["steps"]
-        self.discovered = state["discovered"]
+        self.discovered = dict(state["discovered"])
         self.similarity.load_state_dict(state["similarity"])
         self.novelty.load_state_dict(state["novelty"])
         self.graph.load_state_dict(state["graph"])
@@ -375,18 +380,18 @@ class State:
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1), ..., (s_T, snap_T). The terminal state of a death is no state (R10)."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state is none to return to (R10)."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
     actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
     ended: bool  # by the environment, and not by the number of steps
-    start: int = 0  # the cluster it began from; an additional one: its exploration began from
+    start: int = 0  # the cluster it began from; of an additional one that of its exploration
     # The full prefix s_init ... s_1, states; empty where it began at the initial cluster.
     prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
-    clusters: list[int] = field(default_factory=list)  # T; the cluster of each state, from step 4
+    clusters: list[int] = field(default_factory=list)  # T; of each state, from step 4, unmerged
 
 
 def walk(env, start, seed, steps):
@@ -425,7 +430,7 @@ def roll_back(env, state):
         )
 
 
-def walks(algorithm, jobs, steps):
+def walk_all(algorithm, jobs, steps):
     """`walk` from each state with its seed, in order: here, or in the executor's workers."""
     if algorithm.executor is None:
         return (walk(algorithm.env, start, seed, steps) for start, seed in jobs)
@@ -448,9 +453,10 @@ def walk_in_worker(owner, env_fn, steps, start, seed):
 
 
 def check_lengths(trajectories):
-    """Raise InputError where nearly all end at once, as they do behind a time limit."""
+    """Raise InputError where nearly all end at once, as they do behind a time limit; of a few, as
+    the end of the budget leaves, all may."""
     at_once = sum(tau.ended and len(tau.units) == 1 for tau in trajectories)
-    if at_once > 0.9 * len(trajectories):
+    if len(trajectories) >= 10 and at_once > 0.9 * len(trajectories):
         raise InputError(
             f"{at_once} of {len(trajectories)} trajectories ended at their first "
             "step: is there a time limit, which a rollback does not set back? take "
@@ -493,7 +499,7 @@ def pairs_with_prefix(frames, prefix, N, rng):
 
 
 def balanced(pairs, rng):
-    """As many similar as dissimilar pairs, in random order (R17)."""
+    """As many similar as dissimilar pairs, drawn from all, in random order (R17)."""
     similar = [pair for pair in pairs if pair[2] == 1]
     dissimilar = [pair for pair in pairs if pair[2] == 0]
     size = min(len(similar), len(dissimilar))
@@ -503,7 +509,8 @@ def balanced(pairs, rng):
 
 
 def in_either_order(pair, rng):
-    """A prefix state that always came second would give its class away (R17)."""
+    """The pair, or its states swapped: a prefix state that always came second would give its class
+    away (R17)."""
     s_1, s_2, y = pair
     return (s_2, s_1, y) if rng.random() < 0.5 else pair
 
@@ -620,7 +627,7 @@ class ParentArc:
 
     parent: int
     prefix: np.ndarray  # (k, H, W) from the parent's centre to the cluster's, both included
-    actions: bytes  # they lead from the one to the other
+    actions: bytes  # they lead from the one to the other; numbered from 0
 
 
 class Graph:
@@ -631,8 +638,8 @@ class Graph:
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
         self.adjacent: dict[int, set[int]] = {0: set()}  # ends of its arcs, either way (R8)
-        # For each cluster ever made, but for 0. No merge changes an entry, so that distances along
-        # a prefix stay true and its actions can be replayed: the policy pi^p of section 3.2 (R15).
+        # For each cluster but 0, and its ancestors, merged or not. No merge changes an entry, so
+        # that distances along a prefix stay true, and its actions are pi^p of section 3.2 (R15).
         self.E_parent: dict[int, ParentArc] = {}
         self.created = 1  # clusters ever made
 
@@ -771,7 +778,7 @@ class Graph:
         parents = self.E_parent.items()
         return {
             "clusters": {v: (torch.from_numpy(c.frame), c.snapshot, c.visits) for v, c in clusters},
-            "arcs": self.arcs,
+            "arcs": dict(self.arcs),
             "E_parent": {v: (a.parent, torch.from_numpy(a.prefix), a.actions) for v, a in parents},
             "created": self.created,
         }
@@ -1095,13 +1102,13 @@ class Baseline:
         return {
             "iteration": self.iteration,
             "steps": self.steps,
-            "discovered": self.discovered,
+            "discovered": dict(self.discovered),
         }
 
     def load_state_dict(self, state):
         self.iteration = state["iteration"]
         self.steps = state["steps"]
-        self.discovered = state["discovered"]
+        self.discovered = dict(state["discovered"])
 
 
 class Random(Baseline):

@@ -1323,7 +1323,29 @@ def test_a_time_limit_beyond_the_contracts_walk_stops_the_run_and_says_why():
             return super().reset()
 
     with pytest.raises(InputError, match="first step.*time limit"):
-        RbExplore(Limited, replace(TINY, steps=20_000)).run()
+        RbExplore(Limited, replace(TINY, M=10, steps=20_000)).run()
+
+
+def test_a_few_trajectories_may_all_end_at_once():
+    at_once = tau([0, 1])
+    at_once.ended = True
+    rbexplore.check_lengths([at_once] * 9)
+    longer = tau([0, 1, 2])
+    rbexplore.check_lengths([at_once] * 9 + [longer])
+    with pytest.raises(InputError, match="10 of 10 trajectories ended at their first step"):
+        rbexplore.check_lengths([at_once] * 10)
+
+
+def test_a_state_dict_does_not_change_with_its_algorithm():
+    a = restarted(Maze)
+    a.iterate()
+    state = a.state_dict()
+    before = plain([state["discovered"], state["graph"]])
+    b = restarted(Maze)
+    b.load_state_dict(state)
+    for x in (a, b):
+        x.iterate()
+    assert plain([state["discovered"], state["graph"]]) == before
 
 
 @pytest.mark.parametrize(("changes", "said"), [
