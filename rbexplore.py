@@ -25,9 +25,9 @@ An iteration has five steps (section 4). They are the five calls of `RbExplore.i
     B, beta, L          B, Config.beta, Config.L     novel states; what is novel; how many are drawn
     M                   Config.M                     exploration trajectories an iteration
 
-"S4.2-03" is a statement of the paper and names its test; "R13" is our reading where the paper is
-silent or unclear. The README lists both. A step is an agent step: one action, after the frameskip
-(R1).
+"S4.2-03" is a statement of the paper, and `pytest -k S4_2_03` its test; "R13" is our reading where
+the paper is silent or unclear. The README lists both. A step is an agent step: one action, after
+the frameskip (R1).
 """
 
 import argparse
@@ -391,7 +391,7 @@ class Trajectory:
     # The full prefix s_init ... s_1, states; empty where it began at the initial cluster.
     prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
-    clusters: list[int] = field(default_factory=list)  # T; of each state, from step 4, unmerged
+    clusters: list[int] = field(default_factory=list)  # T; of each state, from step 4
 
 
 def walk(env, start, seed, steps):
@@ -658,11 +658,11 @@ class Graph:
         for v, embedding in zip(self.clusters.values(), embeddings, strict=True):
             v.embedding = embedding
 
-    def most_similar(self, ids, s_i, similarity, theta):
+    def most_similar(self, ids, e_i, similarity, theta):
         """Of these clusters the one whose centre s has the greatest R(s, s_i), if that is above
-        theta (S4.2-03, S4.2-04). s_i: an embedding (d,)."""
+        theta (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
         centres = torch.stack([self.clusters[v].embedding for v in ids])  # (K, d)
-        scores = similarity.score(centres, s_i)  # (K,)
+        scores = similarity.score(centres, e_i)  # (K,)
         best = int(scores.argmax())
         return ids[best] if scores[best] > theta else None
 
@@ -689,13 +689,13 @@ class Graph:
                 self.add_arc(previous, cluster, visits=1)
             tau.clusters.append(cluster)
 
-    def find(self, s_i, previous, similarity, theta_sim):
-        """The cluster to which s_i belongs, an embedding (d,): the most similar of the previous one
-        and those adjacent to it (S4.2-13, R8), else of all (R7), else None (S4.2-05)."""
+    def find(self, e_i, previous, similarity, theta_sim):
+        """The cluster to which s_i belongs: the most similar of the previous one and those adjacent
+        to it (S4.2-13, R8), else of all (R7), else None (S4.2-05). e_i: its embedding (d,)."""
         nearby = sorted({previous} | self.adjacent[previous])
-        found = self.most_similar(nearby, s_i, similarity, theta_sim)
+        found = self.most_similar(nearby, e_i, similarity, theta_sim)
         if found is None:
-            found = self.most_similar(list(self.clusters), s_i, similarity, theta_sim)
+            found = self.most_similar(list(self.clusters), e_i, similarity, theta_sim)
         return found
 
     def create(self, tau, parent_at, i, parent):

@@ -1465,8 +1465,17 @@ def test_S6_2_03_the_encoder_of_icm_learns_by_the_inverse_loss_alone():
         icm.bonus(before, actions, after), ((guess - phi_next) ** 2).sum(1) / 2, rtol=1e-4
     )
     assert np.allclose(inverse.detach(), -logits[range(8), actions], rtol=1e-4)
+    icm.zero_grad()
+    icm.losses(before, actions, after)[1].mean().backward()
+    of_forward = [0.2 * w.grad.clone() for w in icm.forward_model.parameters()]
+    icm.zero_grad()
+    icm.losses(before, actions, after)[0].mean().backward()
+    of_inverse = [0.8 * w.grad.clone() for w in icm.inverse_model.parameters()]
     total = 0.8 * inverse.mean().item() + 0.2 * forward.mean().item()
     losses = icm.learn(before, actions, after)
+    for module, expected in ((icm.forward_model, of_forward), (icm.inverse_model, of_inverse)):
+        for w, gradient in zip(module.parameters(), expected, strict=True):
+            assert torch.allclose(w.grad, gradient, rtol=1e-3, atol=1e-7)
     assert 0.8 * losses["inverse_loss"] + 0.2 * losses["forward_loss"] == pytest.approx(
         total, rel=1e-4
     )
