@@ -545,7 +545,7 @@ class SimilarityModel(nn.Module):
             *dense(width, width),
             *dense(width, 1),
         )
-        initialise(self, config.seed)
+        initialise(self, config.seed, 0)
         self.to(device, memory_format=torch.channels_last)  # which is faster
         self.eval()
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate, fused=True)
@@ -814,8 +814,7 @@ class RND(nn.Module):
             nn.ReLU(),
             nn.Linear(d, d),
         )
-        initialise(self.target, config.seed + 1)
-        initialise(self.predictor, config.seed + 2)
+        initialise(self, config.seed, 1)
         self.target.requires_grad_(False)
         self.to(device)
         self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.learning_rate)
@@ -970,9 +969,10 @@ def channels_of(shape):
     return shape[2] if len(shape) == 3 else 1
 
 
-def initialise(network, seed):
-    """He's initialisation, and biases of 0, from a generator of our own."""
-    generator = torch.Generator().manual_seed(seed)
+def initialise(network, seed, number):
+    """He's initialisation, and biases of 0. The number tells the networks of one seed apart."""
+    generator = torch.Generator()
+    generator.manual_seed(np.random.SeedSequence([seed, number]).generate_state(1).item())
     for layer in network.modules():
         if isinstance(layer, (nn.Conv2d, nn.Linear)):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
@@ -1155,7 +1155,7 @@ class ICM(nn.Module):
         self.encoder = convolutions(layers, shape, d, batch_norm=False)
         self.inverse_model = perceptron(2 * d, config.head_width, actions)
         self.forward_model = perceptron(d + actions, config.head_width, d)
-        initialise(self, config.seed + 3)
+        initialise(self, config.seed, 2)
         self.to(device)
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate)
 
@@ -1239,7 +1239,7 @@ class PPO(Baseline):
                 self.curiosity = RNDBonus(config, shape, device)
             else:
                 self.curiosity = ICM(config, shape, self.actions, device)
-        initialise(self.network, config.seed + 4)
+        initialise(self.network, config.seed, 3)
         head.weight.data *= 0.01  # so that the first policy is uniform and the first values are 0
         self.network.to(device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
