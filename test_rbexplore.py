@@ -1287,19 +1287,14 @@ def test_networks_begin_with_hes_weights_of_their_own():
     assert sizes == [(32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0)]
 
 
-@pytest.mark.parametrize(("make", "workers"), [(ThreadPoolExecutor, 3), (ProcessPoolExecutor, 2)])
-def test_an_executor_changes_nothing(make, workers):
-    options = (
-        {"mp_context": multiprocessing.get_context("spawn")} if make is ProcessPoolExecutor else {}
-    )
-    with make(workers, **options) as executor:
+def test_an_executor_changes_nothing_and_may_be_shared():
+    with ThreadPoolExecutor(3) as executor:
         a = RbExplore(Grid, TINY, executor=executor).run()
-        b = RbExplore(Maze, replace(TINY, steps=900), executor=executor).run()  # it is shared
+        b = RbExplore(Maze, replace(TINY, steps=900), executor=executor).run()
     alone = explorer().run()
-    assert (
-        equal(weights(a.similarity), weights(alone.similarity)) and a.graph.arcs == alone.graph.arcs
-    )
-    assert a.discovered == alone.discovered and b.steps == 900
+    assert equal(weights(a.similarity), weights(alone.similarity))
+    assert a.graph.arcs == alone.graph.arcs and a.discovered == alone.discovered
+    assert b.steps == 900
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
@@ -2102,7 +2097,7 @@ def test_frames_tell_states_apart(playground):
     assert box(flat, look(12, 0)) == [19, 48, 27, 56], "spikes"
 
 
-@pytest.mark.parametrize("level, checksum", [(1, 4221293379), (2, 161113218), (3, 3226354937)])
+@pytest.mark.parametrize("level, checksum", [(1, 4162729437), (2, 1116004422), (3, 1855982883)])
 def test_the_level_map_has_a_box_for_each_reachable_unit(level, checksum):
     env = Maze(level)
     picture, boxes = env.level_map()
@@ -2697,12 +2692,21 @@ def plain(x):
     return [plain(value) for value in x] if isinstance(x, list | tuple) else x
 
 
+def wait_until(condition):
+    deadline = time.monotonic() + 100
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def wait_for_rows(process, folder, count):
     """Until the run has written so many iterations."""
-    deadline = time.monotonic() + 100
-    while not (folder / "metrics.csv").exists() or len(rows_of(folder)) <= count:
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
-        time.sleep(0.05)
+
+    def written():
+        assert process.poll() is None, process.communicate()
+        return (folder / "metrics.csv").exists() and len(rows_of(folder)) > count
+
+    wait_until(written)
 
 
 def refused(capsys, argv, said, code=2):
@@ -2783,16 +2787,19 @@ def test_the_trace_alone_rebuilds_visits_and_arcs(finished):
     assert state["arcs"] == arcs and len(arcs) > 3
 
 
-def test_killed_twice_and_resumed_equals_uninterrupted(finished, tmp_path):
+def test_a_killed_run_leaves_no_worker_and_no_lock_and_is_resumed_to_the_same_bytes(
+    finished, tmp_path, capsys
+):
     folder = tmp_path / "killed"
-    for rows, argv in ((2, [*SMALL_RUN, "--trace", f"--out={folder}"]), (5, ["--resume", folder])):
-        with start(*argv, "--no-figures") as process:
-            wait_for_rows(process, folder, rows)
-            process.kill()
-    assert len(rows_of(folder)) < len(rows_of(finished[0]))
-    with start("--resume", folder, "--no-figures", "--workers=2") as process:
-        out, err = process.communicate()
-    assert process.returncode == 0, err
+    with start(*SMALL_RUN, "--trace", "--workers=2", f"--out={folder}") as process:
+        wait_for_rows(process, folder, 2)
+        refused(capsys, ["--resume", folder], "in use by another process")
+        children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        workers = [pathlib.Path("/proc", pid) for pid in children.read_text().split()]
+        process.kill()
+    assert len(workers) >= 2 and len(rows_of(folder)) < len(rows_of(finished[0]))
+    wait_until(lambda: not any(worker.exists() for worker in workers))
+    assert main(["--resume", str(folder), "--workers=1", "--no-figures"]) == 0
     assert outcome(folder) == outcome(finished[0])
 
 
@@ -2848,29 +2855,6 @@ def test_ctrl_c_exits_with_130_draws_and_can_be_resumed(finished, tmp_path):
     assert {path.name for path in folder.iterdir()} >= FIGURES
     assert main(["--resume", str(folder), "--no-figures"]) == 0
     assert outcome(folder) == outcome(finished[0])
-
-
-def test_a_folder_has_one_owner(finished, tmp_path, capsys):
-    folder = tmp_path / "owned"
-    with start(*SMALL_RUN, f"--out={folder}") as process:
-        wait_for_rows(process, folder, 1)
-        refused(capsys, ["--resume", folder], "in use by another process")
-        process.kill()
-    assert main(["--resume", str(folder), "--no-figures"]) == 0  # a lock ends with its owner
-
-
-def test_workers_end_when_their_parent_is_killed(tmp_path):
-    folder = tmp_path / "killed"
-    with start(*SMALL_RUN, "--workers=2", f"--out={folder}") as process:
-        wait_for_rows(process, folder, 1)
-        children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
-        workers = [int(pid) for pid in children.read_text().split()]
-        process.kill()
-    assert len(workers) >= 2
-    deadline = time.monotonic() + 20
-    while any(pathlib.Path(f"/proc/{pid}").exists() for pid in workers):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 def test_a_folder_of_something_else_is_refused_and_untouched(finished, tmp_path, capsys):
@@ -2932,21 +2916,21 @@ def test_S3_2_03_verify_finds_a_cluster_that_is_not_reached(finished, tmp_path, 
     assert (folder / "checkpoint.pt").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["pop", "montezuma"])
+@pytest.mark.parametrize(("name", "workers"), [("pop", 2), ("montezuma", 1)])
 def test_S3_2_03_a_run_in_an_emulator_is_exact_with_workers_and_after_its_cartridge_moved(
-    rom, tmp_path, capsys, name
+    rom, tmp_path, capsys, name, workers
 ):
     folder = tmp_path / "run"
     cartridge = [f"--rom={rom}"] if name == "pop" else []
     sizes = ["--M=2", "--L=2", "--trajectory-steps=20", "--frame-size=32", "--no-figures"]
-    steps = ["--steps=200", "--pretrain-steps=60", "--theta-sim=0.9", "--workers=2"]
+    steps = ["--steps=110", "--pretrain-steps=40", "--theta-sim=0.9", f"--workers={workers}"]
     argv = [f"--env={name}", "--config=maze", *cartridge, *sizes, *steps, f"--out={folder}"]
     assert main(argv) == 0
     if name == "pop":
         os.rename(rom, tmp_path / "moved.nes")
         refused(capsys, ["--verify", folder], "cannot read the cartridge")
         cartridge = [f"--rom={tmp_path / 'moved.nes'}"]
-    resume = ["--resume", str(folder), "--steps=260", "--workers=1", "--no-figures"]
+    resume = ["--resume", str(folder), "--steps=130", "--workers=1", "--no-figures"]
     assert main([*resume, *cartridge]) == 0
     assert main(["--verify", str(folder), *cartridge]) == 0
     clusters = len(rbexplore.read_checkpoint(folder)["algorithm"]["graph"]["clusters"])
@@ -3180,15 +3164,7 @@ def test_an_experiments_runs_end_with_it(tmp_path):
         folder = tmp_path / "rbexplore-0"
         wait_for_rows(process, folder, 1)
         process.terminate()
-    deadline = time.monotonic() + 20
-    lock = rbexplore.filelock.FileLock(folder / ".lock")
-    while True:
-        try:
-            lock.acquire(timeout=0)
-            break
-        except rbexplore.filelock.Timeout:
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
+    rbexplore.filelock.FileLock(folder / ".lock").acquire(timeout=20)
 
 
 def test_as_many_runs_as_cores_may_be_used(monkeypatch):
