@@ -175,9 +175,10 @@ class RbExplore:
     """The algorithm of section 4.
 
     env_fn makes the persistent environment (envs.PersistentEnv says what that is); with an executor
-    of processes it must pickle. device is where the networks are. executor, any of
-    concurrent.futures, walks the trajectories; the result is the same for each. Raises InputError
-    for an environment that breaks the contract, or a loss that is not finite."""
+    of processes it must pickle. device is where the networks are. executor, one of
+    concurrent.futures, walks the trajectories, with the same result; of threads only where a
+    process may hold several such environments (one cartridge it may not). Raises InputError for an
+    environment that breaks the contract, or a loss that is not finite."""
 
     def __init__(self, env_fn, config=None, device="cpu", executor=None):
         self.config = config or Config()
@@ -572,8 +573,8 @@ class SimilarityModel(nn.Module):
         return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
     def fit(self, pairs, rng):
-        """Minimise the binary cross-entropy, `epochs` passes (R19). Returns the mean loss of the
-        last; None where there are no pairs of both classes."""
+        """Minimise the binary cross-entropy, `epochs` passes (R19), each over a balanced draw of its
+        own. Returns the mean loss of the last; None where there are no pairs of both classes."""
         losses = []
         self.train()
         try:
@@ -680,7 +681,7 @@ class Graph:
             previous = cluster
             cluster = self.find(embeddings[i], previous, similarity, theta_sim)
             if cluster is None:
-                cluster = self.create(tau, parent_at, i, parent)
+                cluster = self.create(tau, i, parent, parent_at)
                 self.clusters[cluster].embedding = embeddings[i]
                 parent = cluster
                 parent_at = i
@@ -698,9 +699,9 @@ class Graph:
             found = self.most_similar(list(self.clusters), e_i, similarity, theta_sim)
         return found
 
-    def create(self, tau, parent_at, i, parent):
+    def create(self, tau, i, parent, parent_at):
         """Make a cluster of state i of tau, and its arc to the parent, whose centre is state
-        parent_at (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
+        parent_at of tau (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
         new = self.created
         self.created += 1
         prefix = tau.frames[parent_at : i + 1].copy()  # a view would keep the whole of tau
@@ -734,7 +735,7 @@ class Graph:
             states += list(self.E_parent[u].prefix)
         return states
 
-    def replay(self, v):
+    def actions_to(self, v):
         """The actions that lead from s_init to the centre of v: pi^p of section 3.2 (S3.2-03)."""
         return b"".join(self.E_parent[u].actions for u in self.lineage(v))
 
@@ -1002,8 +1003,8 @@ def batches(items, size):
 
 
 def descend(optimiser, loss, name, max_norm=math.inf):
-    """One step down the loss, its gradient clipped. InputError: the loss is infinite or no
-    number."""
+    """One step down the loss, its gradient at most max_norm long. InputError: the loss is infinite
+    or no number."""
     if not math.isfinite(loss.item()):
         raise InputError(f"the loss of {name} is {loss.item()}: give a lower learning rate")
     optimiser.zero_grad()
@@ -1679,7 +1680,7 @@ def verify(algorithm):
     lines = [f"{'cluster':>9}{'visits':>9}{'steps from s_init':>19}   replayed   restored"]
     wrong = 0
     for v, cluster in graph.clusters.items():
-        actions = graph.replay(v)
+        actions = graph.actions_to(v)
         frame, unit = play(env, cluster.snapshot, b"")
         restored = np.array_equal(frame, cluster.frame)
         frame, replayed_unit = play(env, algorithm.initial_state.snapshot, actions)
@@ -1922,7 +1923,7 @@ def route_animation(graph):
     """The way from s_init to the cluster that is furthest from it: frames of an animation."""
     from PIL import Image
 
-    furthest = max(graph.clusters, key=lambda v: len(graph.replay(v)))
+    furthest = max(graph.clusters, key=lambda v: len(graph.actions_to(v)))
     states = graph.full_prefix(furthest) or [graph.clusters[0].frame]
     scale = max(1, 256 // max(states[0].shape[:2]))
     frames = [viewable(s).repeat(scale, axis=0).repeat(scale, axis=1) for s in states]

@@ -249,7 +249,7 @@ def test_S3_2_03_the_stored_actions_lead_from_s_init_to_every_centre(maze_run):
     assert len(a.graph.clusters) > 5 and sum(len(i.merged) for i in iterations) > 0
     for v, cluster in a.graph.clusters.items():
         seen = a.env.restore(a.initial_state.snapshot)
-        for action in a.graph.replay(v):
+        for action in a.graph.actions_to(v):
             seen = a.env.step(action)[0]
         assert np.array_equal(seen, cluster.frame)
         assert a.env.snapshot() == cluster.snapshot
@@ -854,7 +854,7 @@ def test_S4_2_21_the_full_prefix_is_what_was_walked_from_s_init_in_the_order_of_
     graph, stub = grown([(0, [0, 1, 2, 10, 11, 3, 20]), (1, [10, 12, 4, 30, 31])])
     full = {0: [], 1: [0, 1, 2, 10], 2: [0, 1, 2, 10, 11, 3, 20], 3: [0, 1, 2, 10, 12, 4, 30]}
     assert {v: numbers_of(graph.full_prefix(v)) for v in full} == full
-    assert graph.replay(3) == bytes([1, 2, 10, 12, 4, 30]) and graph.replay(0) == b""
+    assert graph.actions_to(3) == bytes([1, 2, 10, 12, 4, 30]) and graph.actions_to(0) == b""
     stub.R = table({(0, 10): 1.0})
     assert graph.merge(stub, 0.5) == {1: 0}  # the parent of 2 and 3: their prefixes stay (R15)
     assert {v: numbers_of(graph.full_prefix(v)) for v in (2, 3)} == {2: full[2], 3: full[3]}
