@@ -573,8 +573,9 @@ class SimilarityModel(nn.Module):
         return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
     def fit(self, pairs, rng):
-        """Minimise the binary cross-entropy, `epochs` passes (R19), each over a balanced draw of its
-        own. Returns the mean loss of the last; None where there are no pairs of both classes."""
+        """Minimise the binary cross-entropy in `epochs` passes (R19), each over a balanced draw of
+        its own. Returns the mean loss of the last; None where there are no pairs of both
+        classes."""
         losses = []
         self.train()
         try:

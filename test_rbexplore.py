@@ -1265,6 +1265,7 @@ def test_no_two_networks_begin_alike_be_it_of_one_seed_or_of_neighbours():
         encoders.append(ICM(config, (32, 32), 7, "cpu").encoder)
         encoders.append(PPO(Maze, config, "rnd", "cpu").network[0])
         first_layers |= {tuple(encoder[0].weight.flatten().tolist()) for encoder in encoders}
+        assert not any(isinstance(m, nn.BatchNorm2d) for e in encoders[1:] for m in e.modules())
     assert len(first_layers) == 10
 
 
@@ -1418,6 +1419,8 @@ def test_S6_2_03_S6_2_04_every_method_stops_at_the_budget_and_covers_by_the_same
     assert a.env.steps_made == a.steps == metrics["steps"] == 700
     assert a.discovered[(6, 1, 2)] == 0 and max(a.discovered.values()) <= 700
     assert metrics["units"] == len(a.discovered) > 3 and metrics["phase"] == "explore"
+    kinds = {"rbexplore": SimilarityModel, "cells": Cells}
+    assert type(getattr(a, "similarity", None)) is kinds.get(method, type(None))
     with pytest.raises(InputError, match="budget"):
         a.iterate()
 
@@ -1534,20 +1537,55 @@ def test_S6_2_03_a_bonus_is_scaled_by_the_deviation_of_its_discounted_sums():
     assert np.allclose(scaled[1], bonus[25:] / np.std(sums), rtol=1e-3)
 
 
-def test_S6_2_03_ppos_step_is_its_clipped_objective():
-    for gain in (1.0, -1.0):  # at a ratio beyond the clip only an advantage that pulls back counts
-        a = PPO(Corridor, replace(AGENT, learning_rate=1e-9), "rnd", "cpu")
-        x = pictures(16)
-        with torch.no_grad():
-            log_p, values = a.policy(x)
-        old = (log_p[:, 0] - math.log(1.3)).numpy()  # ratio 1.3
-        for parameter in a.network.parameters():
-            parameter.grad = None
-        losses = a.update(x, np.zeros(16, int), old, np.full(16, gain), values.numpy())
-        pull = a.network[-1].weight.grad[:2].abs().sum().item()
-        assert (pull > 0.05) == (gain < 0)
-        assert losses["value_loss"] == pytest.approx(0, abs=1e-6)
-        assert losses["entropy"] == pytest.approx(math.log(2), abs=0.01)
+@pytest.mark.parametrize("ratio", [0.7, 0.95, 1.05, 1.3])
+@pytest.mark.parametrize("advantage", [2.0, -2.0])
+def test_S6_2_03_ppos_step_is_its_clipped_objective(ratio, advantage):
+    a = PPO(Corridor, AGENT, "rnd", "cpu")
+    with torch.no_grad():
+        a.network[-1].bias[0] = 1.0  # so that the entropy has a gradient
+    x = pictures(16)
+    log_p, values = a.policy(x)
+    old = log_p[:, 0].detach() - math.log(ratio)
+    gain = min(ratio * advantage, min(max(ratio, 0.9), 1.1) * advantage)
+    # Beyond the clip only an advantage that pulls back counts.
+    counts = gain == ratio * advantage
+    entropy = -(log_p.exp() * log_p).sum(1).mean()
+    surrogate = ((log_p[:, 0] - old).exp() * advantage).mean() if counts else 0
+    loss = 0.5 * (values - 3).square().mean() - surrogate - 0.001 * entropy
+    parameters = list(a.network.parameters())
+    expected = torch.autograd.grad(loss, parameters)
+    returns = np.full(16, 3.0, np.float32)
+    losses = a.update(x, np.zeros(16, int), old.numpy(), np.full(16, advantage), returns)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        assert torch.allclose(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
+    assert losses["value_loss"] == pytest.approx((values - 3).square().mean().item(), rel=1e-4)
+    assert losses["entropy"] == pytest.approx(entropy.item(), rel=1e-4)
+
+
+def test_S6_2_03_actions_are_samples_of_the_policy():
+    a = PPO(Maze, AGENT, "rnd", "cpu")
+    p = np.array([0.4, 0.3, 0.1, 0.1, 0.05, 0.03, 0.02])
+    with torch.no_grad():
+        a.network[-1].weight.zero_()
+        a.network[-1].bias[:7] = torch.from_numpy(np.log(p))
+    rng = np.random.default_rng(0)
+    acted = [a.act(pictures(1)[0], rng) for _ in range(2000)]
+    drawn = np.bincount([action for action, _, _ in acted], minlength=7) / 2000
+    assert np.abs(drawn - p).max() < 0.04
+    assert all(log_p == pytest.approx(math.log(p[action]), abs=1e-4) for action, log_p, _ in acted)
+
+
+def test_R27_a_rollout_is_learned_in_four_passes_of_four_minibatches():
+    a = PPO(Corridor, AGENT, "rnd", "cpu")
+    seen = []
+    a.update = lambda frames, *rest: seen.append(numbers_of(frames)) or {}
+    a.curiosity.learn = lambda *batch: {"rnd_loss": 0.0}
+    a.rollout = lambda rng, rollout=a.rollout: seen.append(rollout(rng)) or seen[0]
+    a.iterate()
+    rollout = sorted(numbers_of(seen.pop(0)[0]))
+    assert [len(batch) for batch in seen] == [50] * 16
+    for k in range(0, 16, 4):
+        assert sorted(sum(seen[k : k + 4], [])) == rollout
 
 
 def test_R27_ppos_values_are_burdas():
@@ -1571,13 +1609,16 @@ def test_cells_are_equal_where_11_by_8_pixels_of_8_greys_are():
         other = light.copy()
         other[0, :12, :9] -= change
         assert cells.score(cells.embed(light), cells.embed(other)[0])[0] == same
+    both = cells.embed(np.concatenate([light, light // 2]))
+    assert cells.score(both, both[1]).tolist() == [0, 1]
     assert cells.embed(light).shape == (1, 88) and cells.embed(light).unique().tolist() == [6]
     assert cells.embed(np.full((1, 96, 96, 3), 255, np.uint8)).unique().tolist() == [7]
 
 
 @pytest.mark.parametrize("method", ["rnd", "icm", "random", "cells"])
 def test_a_method_goes_on_from_its_state_as_if_never_interrupted(method):
-    whole, first, second = (make_method(method, Maze, replace(AGENT, steps=1500)) for _ in range(3))
+    config = replace(AGENT, steps=1500, rollout_steps=130)
+    whole, first, second = (make_method(method, Maze, config) for _ in range(3))
     whole_metrics = [whole.iterate().metrics for _ in range(4)]
     for _ in range(2):
         first.iterate()
