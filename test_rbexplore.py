@@ -475,6 +475,18 @@ def test_S4_1_07_y_is_1_for_close_states_and_R_learns_it():
     assert told == (1.0, 0.0)
 
 
+def test_rates_are_shares_of_each_class_at_a_threshold_of_a_half_of_at_most_1000_pairs():
+    model = SimilarityModel(MAZE, (32, 32))
+    seen = []
+    model.embed = lambda frames: seen.append(len(frames)) or torch.tensor(numbers_of(frames))
+    model.score = lambda e_1, e_2: np.where(e_1 == 0, 0.4, 0.6)
+    # Of each class one pair at 0.6 and three at 0.4.
+    pairs = [(frame(k), frame(k), y) for k in (1, 0, 0, 0) for y in (1, 0)]
+    assert model.rates(pairs, np.random.default_rng(0)) == (0.25, 0.75)
+    model.rates(pairs * 200, np.random.default_rng(0))
+    assert seen == [8, 8, 1000, 1000]
+
+
 def test_S4_1_08_the_loss_is_binary_cross_entropy():
     model = SimilarityModel(MAZE, (32, 32)).train()
     x = pictures(16)
