@@ -94,10 +94,10 @@ class Config:
     merge_every: int = option(15, "iterations from one merge to the next (6.1, R28)", 1)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
     small_networks: bool = option(
-        False, "small encoders: not ResNet-18 for R (6.1), not Burda's for RND"
+        False, "small encoders: not ResNet-18 for R (6.1), not Burda's for the others"
     )
     embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
-    head_width: int = option(512, "width of fully connected layers (R20)", 1)
+    head_width: int = option(512, "width of fully connected layers; the paper gives none", 1)
     learning_rate: float = option(1e-4, "Adam's (R18)", 0)
     r_batch: int = option(256, "pairs in a batch of R (R18)", 2)
     rnd_batch: int = option(256, "states in a batch of RND (R18)", 1)
@@ -389,7 +389,7 @@ class Trajectory:
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
     ended: bool  # by the environment, and not by the number of steps
     start: int = 0  # the cluster it began from; of an additional one that of its exploration
-    # The full prefix s_init ... s_1, states; empty where it began at the initial cluster.
+    # The full prefix s_init ... s_1, states; empty of an exploration from the initial cluster.
     prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
     clusters: list[int] = field(default_factory=list)  # T; of each state, from step 4
@@ -1215,8 +1215,8 @@ def advantages_of(rewards, values, last_value, gamma, gae_lambda):
 
 class PPO(Baseline):
     """Proximal policy optimisation (Schulman et al. 2017) of a bonus alone, RND's or ICM's, by the
-    settings of Burda et al. 2019, table 5 (R27), but for one actor, whose rollout is as long as
-    that of their 128, and a policy that sees what RbExplore sees: one frame (5)."""
+    settings of Burda et al. 2019, table 5 (R27), but for one actor, whose rollout is by default as
+    long as that of their 128, and a policy that sees what RbExplore sees: one frame (5)."""
 
     GAMMA = 0.99  # discount of the intrinsic reward
     GAE_LAMBDA = 0.95
