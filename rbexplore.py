@@ -83,7 +83,7 @@ class Config:
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
     L: int = option(1000, "novel states to walk on from, at most, an iteration (6.1)", 0)
     additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
-    beta: float = option(2.5, "a state is novel above it: deviations over the mean (6.1, R4)")
+    beta: float = option(2.5, "a state is novel above this reward, in deviations (6.1, R4)")
     n: int = option(5, "pairs closer than this are similar, steps (6.1)", 1)
     N: int = option(25, "pairs further apart than this are dissimilar, steps (6.1)", 1)
     prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
@@ -108,8 +108,8 @@ class Config:
         self.check_fields()
         if self.n > self.N:
             raise InputError(
-                f"n is {self.n} and N is {self.N}: a pair cannot be both similar and "
-                "dissimilar; give n <= N"
+                f"n is {self.n} and N is {self.N}: similar states are closer than "
+                "dissimilar ones; give n <= N"
             )
         for name in ("trajectory_steps", "additional_steps"):
             if getattr(self, name) <= self.N:
@@ -174,11 +174,11 @@ class Iteration:
 class RbExplore:
     """The algorithm of section 4.
 
-    env_fn makes the persistent environment (envs.PersistentEnv says what that is); with an executor
-    of processes it must pickle. device is where the networks are. executor, one of
-    concurrent.futures, walks the trajectories, with the same result; of threads only where a
-    process may hold several such environments (one cartridge it may not). Raises InputError for an
-    environment that breaks the contract, or a loss that is not finite."""
+    env_fn makes the persistent environment (envs.PersistentEnv says what that is). device is where
+    the networks are. executor, one of concurrent.futures, walks the trajectories, with the same
+    result. Processes need an env_fn that pickles; with threads several environments live in one
+    process, which the cartridge's emulator does not allow. Raises InputError for an environment
+    that breaks the contract, or a loss that is not finite."""
 
     def __init__(self, env_fn, config=None, device="cpu", executor=None):
         self.config = config or Config()
@@ -210,8 +210,8 @@ class RbExplore:
         # draws, so that what one draws does not shift the next.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
-        theta_sim = self.theta_sim()
-        clusters_before = self.graph.created
+        theta_sim = self.theta_sim()  # before any step is taken: it begins at 0 (S6.1-13)
+        first_new = self.graph.next_number
 
         trajectories = self.explore(rng_1)
         pairs, additional = self.make_pairs(trajectories, rng_2)
@@ -224,7 +224,7 @@ class RbExplore:
             **progress_metrics(self),
             "theta_sim": theta_sim,
             "clusters": len(self.graph.clusters),
-            "added": self.graph.created - clusters_before,
+            "added": self.graph.next_number - first_new,
             "merged": len(merged),
             "novel_share": float(np.mean(novelty > self.config.beta)),
             "additional": len(additional),
@@ -259,38 +259,36 @@ class RbExplore:
         Clusters are drawn with replacement, as G begins with a single one (R12)."""
         clusters, probabilities = self.graph.sampling_distribution()
         sampled = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
-        centres = [self.graph.centre(v) for v in sampled]
+        centres = [self.graph.clusters[v] for v in sampled]
         covers = not self.pretraining
         trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
-        for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the budget ended
+        for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the steps ended
             tau.start = v
             tau.prefix = self.graph.full_prefix(v)
         check_lengths(trajectories)
         return trajectories
 
-    def collect(self, starts, steps, covers, rng):
-        """Roll back to each state and walk at most `steps` steps.
+    def collect(self, starts, max_steps, covers, rng):
+        """Roll back to each state and walk at most `max_steps` steps.
 
         Each step counts, whatever it serves (R2), and none is taken beyond the end of pretraining
         or of the budget (S6.2-04), so there may be fewer trajectories then. covers: whether its
         steps count for coverage (R25)."""
         end = self.config.pretrain_steps if self.pretraining else self.config.steps
         seeds = rng.integers(2**63, size=len(starts)).tolist()
-        jobs = list(zip(starts, seeds, strict=True))
         trajectories = []
-        bar = progress(total=len(jobs), what="walk")
-        while len(trajectories) < len(jobs) and self.steps < end:
+        while len(trajectories) < len(starts) and self.steps < end:
             left = end - self.steps
-            fitting = max(1, left // steps)  # walks that fit, if each takes all its steps
-            batch = jobs[len(trajectories) :][:fitting]
-            for tau in walk_all(self, batch, min(steps, left)):
+            limit = min(max_steps, left)
+            fitting = left // limit  # walks that fit, if each takes all its steps
+            first = len(trajectories)
+            jobs = [(starts[k], seeds[k], limit) for k in range(first, len(starts))][:fitting]
+            for tau in progress(walk_all(self, jobs), "walk", len(jobs)):
                 for unit in tau.units:
                     self.steps += 1
                     if covers and unit is not None:
                         self.discovered.setdefault(unit, self.steps)
                 trajectories.append(tau)
-                bar.update()
-        bar.close()
         return trajectories
 
     def make_pairs(self, trajectories, rng):
@@ -300,6 +298,7 @@ class RbExplore:
         pairs = []
         for tau in trajectories + additional:
             pairs += pairs_within(tau.frames, self.config.n, self.config.N, rng)
+        # In a loop of its own: without it the other pairs are the same (S6.3-02).
         if self.config.prefix:
             for tau in trajectories + additional:
                 pairs += pairs_with_prefix(tau.frames, tau.prefix, self.config.N, rng)
@@ -308,8 +307,8 @@ class RbExplore:
     def walk_on_from_novel_states(self, trajectories, rng):
         """Put the novel states into B, sample L of them, walk on from these (S4.2-15 ... S4.2-18).
 
-        Novel is told by the RND of the iteration before. B holds the novel states of this one only
-        (R5). The walks serve R alone."""
+        The RND of the iteration before decides what is novel. B holds the novel states of this
+        iteration only (R5). The walks serve R alone."""
         B = []  # a novel state: its trajectory, and its index there
         for tau in trajectories:
             tau.novelty = self.novelty.reward(tau.frames)
@@ -317,7 +316,7 @@ class RbExplore:
         sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]
         novel_states = [State(tau.frames[i], tau.snapshots[i]) for tau, i in sample]
         additional = self.collect(novel_states, self.config.additional_steps, False, rng)
-        for walked, (tau, i) in zip(additional, sample, strict=False):  # fewer, as in `explore`
+        for walked, (tau, i) in zip(additional, sample, strict=False):
             walked.start = tau.start
             # The full prefix goes on from tau's, which ends with its s_1, to the novel state (R29).
             walked.prefix = tau.prefix[:-1] + list(tau.frames[: i + 1])
@@ -381,23 +380,24 @@ class State:
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state is none to return to (R10)."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state, which cannot be returned to, is
+    not stored (R10)."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
     actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
     ended: bool  # by the environment, and not by the number of steps
-    start: int = 0  # the cluster it began from; of an additional one that of its exploration
-    # The full prefix s_init ... s_1, states; empty of an exploration from the initial cluster.
+    start: int = 0  # the cluster that it began from, or, of an additional one, its exploration did
+    # Frames of the full prefix s_init ... s_1; empty of an exploration from the initial cluster.
     prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
-    clusters: list[int] = field(default_factory=list)  # T; of each state, from step 4
+    clusters: list[int] = field(default_factory=list)  # T; of each state in step 4, before merges
 
 
-def walk(env, start, seed, steps):
+def walk(env, start, seed, max_steps):
     """Roll back to `start` and follow pi_explore, uniform over the actions (6.1; S4.2-02), for
-    `steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments
+    `max_steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments
     alone."""
     rng = np.random.default_rng(seed)
     roll_back(env, start)
@@ -407,7 +407,7 @@ def walk(env, start, seed, steps):
     units = []
     since_state = b""  # the actions since the last state
     ended = False
-    while len(units) < steps and not ended:
+    while len(units) < max_steps and not ended:
         action = int(rng.integers(env.action_space.n))
         frame, _, terminated, truncated, info = env.step(int(env.action_space.start) + action)
         units.append(unit_key(env.unit()))
@@ -423,7 +423,8 @@ def walk(env, start, seed, steps):
 
 
 def roll_back(env, state):
-    """Return to a state, at no step (S3.2-02). InputError: it gives another frame (S4-01)."""
+    """Return to a state, at no step (S3.2-02). Raises InputError if the frame is another one
+    (S4-01)."""
     if not np.array_equal(env.restore(state.snapshot), state.frame):
         raise InputError(
             "restore() did not give the frame of its snapshot again: part of the "
@@ -431,18 +432,18 @@ def roll_back(env, state):
         )
 
 
-def walk_all(algorithm, jobs, steps):
-    """`walk` from each state with its seed, in order: here, or in the executor's workers."""
+def walk_all(algorithm, jobs):
+    """`walk` for each (start, seed, max_steps), in order: here, or in the executor's workers."""
     if algorithm.executor is None:
-        return (walk(algorithm.env, start, seed, steps) for start, seed in jobs)
-    remote = functools.partial(walk_in_worker, algorithm.worker_key, algorithm.env_fn, steps)
-    return algorithm.executor.map(remote, *zip(*jobs, strict=True))
+        return (walk(algorithm.env, *job) for job in jobs)
+    remote = functools.partial(walk_in_worker, algorithm.worker_key, algorithm.env_fn)
+    return algorithm.executor.map(remote, jobs)
 
 
 _worker = threading.local()  # the environment of this process or thread, and whose it is
 
 
-def walk_in_worker(owner, env_fn, steps, start, seed):
+def walk_in_worker(owner, env_fn, job):
     """`walk` in an environment that is made at the first job of its owner, and kept."""
     if getattr(_worker, "owner", None) != owner:
         if hasattr(_worker, "env"):
@@ -450,12 +451,12 @@ def walk_in_worker(owner, env_fn, steps, start, seed):
         _worker.env = env_fn()
         _worker.env.reset()
         _worker.owner = owner
-    return walk(_worker.env, start, seed, steps)
+    return walk(_worker.env, *job)
 
 
 def check_lengths(trajectories):
-    """Raise InputError where nearly all end at once, as they do behind a time limit; of a few, as
-    the end of the budget leaves, all may."""
+    """Raise InputError where more than 90 % end at their first step, as they do behind a time
+    limit. Fewer than ten trajectories, as the end of the budget leaves, are not judged."""
     at_once = sum(tau.ended and len(tau.units) == 1 for tau in trajectories)
     if len(trajectories) >= 10 and at_once > 0.9 * len(trajectories):
         raise InputError(
@@ -472,12 +473,12 @@ def check_lengths(trajectories):
 
 def pairs_within(frames, n, N, rng):
     """Figure 2 (a), (b): for each state of a trajectory (T, H, W) a similar one, and a dissimilar
-    one if there is any, each drawn from all of the same trajectory (R17)."""
+    one if there is any, each uniform among those of the same trajectory (R17)."""
     pairs = []
     position = np.arange(len(frames))
     for i in range(len(frames)):
         distance = np.abs(position - i)
-        similar = np.flatnonzero(distance < n)
+        similar = np.flatnonzero(distance < n)  # i itself included, as 0 < n (R30)
         pairs.append((frames[i], frames[rng.choice(similar)], 1))
         dissimilar = np.flatnonzero(distance > N)
         if len(dissimilar) > 0:
@@ -486,12 +487,13 @@ def pairs_within(frames, n, N, rng):
 
 
 def pairs_with_prefix(frames, prefix, N, rng):
-    """Figure 2 (c): for each state of a trajectory (T, H, W) a state of its full prefix, drawn from
-    all that are more than N steps away along the joined path (S4.2-22, S4.2-23, R16)."""
+    """Figure 2 (c): for each state of a trajectory (T, H, W) a state of its full prefix, if there
+    is any, uniform among those more than N steps away along the joined path (S4.2-22, S4.2-23,
+    R16)."""
     pairs = []
     position = np.arange(len(prefix))
     for i in range(len(frames)):
-        # The prefix ends with s_1, with which the trajectory begins.
+        # The prefix ends with s_1, with which the trajectory begins. Of an empty one none is drawn.
         distance = (len(prefix) - 1 + i) - position
         distant = np.flatnonzero(distance > N)
         if len(distant) > 0:
@@ -500,7 +502,7 @@ def pairs_with_prefix(frames, prefix, N, rng):
 
 
 def balanced(pairs, rng):
-    """As many similar as dissimilar pairs, drawn from all, in random order (R17)."""
+    """As many similar as dissimilar pairs, drawn anew at each call, in random order (R17)."""
     similar = [pair for pair in pairs if pair[2] == 1]
     dissimilar = [pair for pair in pairs if pair[2] == 0]
     size = min(len(similar), len(dissimilar))
@@ -516,7 +518,7 @@ def in_either_order(pair, rng):
     return (s_2, s_1, y) if rng.random() < 0.5 else pair
 
 
-def stack(pairs):
+def stack_pairs(pairs):
     """Frames s_1 (B, H, W), frames s_2 (B, H, W), labels (B,)."""
     s_1, s_2, y = zip(*pairs, strict=True)
     return np.stack(s_1), np.stack(s_2), np.array(y)
@@ -527,8 +529,8 @@ def stack(pairs):
 
 class SimilarityModel(nn.Module):
     """R_w(s_1, s_2): one encoder embeds both frames, four fully connected layers classify the two
-    embeddings (6.1). It is in evaluation mode but within `fit`, so that R of a pair depends on that
-    pair alone (S4.1-01). shape: of a frame, (H, W) or (H, W, C)."""
+    embeddings (6.1). It is in evaluation mode except during `fit`, so that R of a pair depends on
+    that pair alone (S4.1-01). shape: of a frame, (H, W) or (H, W, C)."""
 
     def __init__(self, config, shape, device="cpu"):
         super().__init__()
@@ -536,7 +538,7 @@ class SimilarityModel(nn.Module):
         self.batch_size = config.r_batch
         self.device = device
         if config.small_networks:
-            self.encoder = convolutions(SMALL, shape, config.embedding, batch_norm=True)
+            self.encoder = conv_encoder(SMALL, shape, config.embedding, batch_norm=True)
         else:
             self.encoder = ResNet18(channels_of(shape), config.embedding)
         width = config.head_width
@@ -569,7 +571,7 @@ class SimilarityModel(nn.Module):
 
     @torch.no_grad()
     def score(self, e_1, e_2):
-        """R of embeddings (K, d), and (K, d) or (d,) -> (K,) in [0, 1]."""
+        """R of embeddings (K, d) with as many others, or with one (d,) -> (K,) in [0, 1]."""
         return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
     def fit(self, pairs, rng):
@@ -580,8 +582,9 @@ class SimilarityModel(nn.Module):
         self.train()
         try:
             for _ in range(self.epochs):
-                shuffled = batches(balanced(pairs, rng), self.batch_size)
-                losses = [self.update(*stack(batch)) for batch in progress(shuffled, "train R")]
+                losses = []
+                for batch in progress(batches(balanced(pairs, rng), self.batch_size), "train R"):
+                    losses.append(self.update(*stack_pairs(batch)))
         finally:
             self.eval()  # also after Ctrl-C
         return float(np.mean(losses)) if losses else None
@@ -591,7 +594,7 @@ class SimilarityModel(nn.Module):
         of -y log R - (1 - y) log(1 - R) (S4.1-08)."""
         labels = torch.from_numpy(y).float().to(self.device)
         loss = F.binary_cross_entropy_with_logits(self(s_1, s_2), labels)
-        descend(self.optimiser, loss, "R", max_norm=1.0)  # R18
+        gradient_step(self.optimiser, loss, "R", max_norm=1.0)  # R18
         return loss.item()
 
     def rates(self, pairs, rng):
@@ -600,7 +603,7 @@ class SimilarityModel(nn.Module):
         chosen = balanced(pairs, rng)[:1000]
         if not chosen:
             return None, None
-        s_1, s_2, y = stack(chosen)
+        s_1, s_2, y = stack_pairs(chosen)
         R = self.score(self.embed(s_1), self.embed(s_2))
         return float(np.mean(R[y == 1] > 0.5)), float(np.mean(R[y == 0] <= 0.5))
 
@@ -617,10 +620,9 @@ class SimilarityModel(nn.Module):
 
 @dataclass
 class Cluster(State):
-    """v = (s, snap): the centre of a cluster, and what G knows of it."""
+    """v = (s, snap): the centre of a cluster, and its visits."""
 
     visits: int = 0  # states assigned to it, its own centre included (R11)
-    embedding: torch.Tensor | None = None  # (d,) of the centre, by the R of this iteration
 
 
 @dataclass(frozen=True)
@@ -633,37 +635,34 @@ class ParentArc:
 
 
 class Graph:
-    """G. Clusters are numbered in the order of creation; number 0 is the initial one (S4.2-11)."""
+    """G. Clusters are numbered in the order of creation; number 0 is the initial one (S4.2-11).
+    In what follows v, u, later and earlier are such numbers."""
 
     def __init__(self, initial_state):
         initial = Cluster(initial_state.frame, initial_state.snapshot, visits=1)
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
-        self.adjacent: dict[int, set[int]] = {0: set()}  # ends of its arcs, either way (R8)
+        self.adjacent: dict[int, set[int]] = {0: set()}  # predecessors and successors (R8)
         # For each cluster but 0, and its ancestors, merged or not. No merge changes an entry, so
         # that distances along a prefix stay true, and its actions are pi^p of section 3.2 (R15).
         self.E_parent: dict[int, ParentArc] = {}
-        self.created = 1  # clusters ever made
+        self.next_number = 1  # of the cluster made next
+        self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the R of now
 
     def sampling_distribution(self):
         """sigma: the clusters, each with a probability inverse to its visits (6.1; S4.2-12)."""
-        weights = np.array([1 / v.visits for v in self.clusters.values()])
+        weights = np.array([1 / cluster.visits for cluster in self.clusters.values()])
         return list(self.clusters), weights / weights.sum()
-
-    def centre(self, v):
-        """The state of a cluster alone, without what G knows of it: it may travel to a worker."""
-        return State(self.clusters[v].frame, self.clusters[v].snapshot)
 
     def embed_centres(self, similarity):
         """Embed all centres by the R of now (S4-03)."""
-        embeddings = similarity.embed(np.stack([v.frame for v in self.clusters.values()]))
-        for v, embedding in zip(self.clusters.values(), embeddings, strict=True):
-            v.embedding = embedding
+        frames = np.stack([cluster.frame for cluster in self.clusters.values()])
+        self.embeddings = dict(zip(self.clusters, similarity.embed(frames), strict=True))
 
     def most_similar(self, ids, e_i, similarity, theta):
         """Of these clusters the one whose centre s has the greatest R(s, s_i), if that is above
-        theta (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
-        centres = torch.stack([self.clusters[v].embedding for v in ids])  # (K, d)
+        theta, else None (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
+        centres = torch.stack([self.embeddings[v] for v in ids])  # (K, d)
         scores = similarity.score(centres, e_i)  # (K,)
         best = int(scores.argmax())
         return ids[best] if scores[best] > theta else None
@@ -673,23 +672,19 @@ class Graph:
         different clusters make an arc (S4.2-07, S4.2-08). tau.clusters then tells where each state
         went."""
         embeddings = similarity.embed(tau.frames)  # (T, d)
-        cluster = tau.start  # s_1 is its centre (R9)
-        self.clusters[cluster].visits += 1
-        tau.clusters = [cluster]
-        parent = tau.start  # the cluster made last on this trajectory, else the start (R13)
-        parent_at = 0
+        tau.clusters = [tau.start]  # s_1 is its centre (R9)
+        self.clusters[tau.start].visits += 1
+        parent_at = 0  # the state of tau with which the latest cluster was made: a parent (R13)
         for i in range(1, len(tau.frames)):
-            previous = cluster
-            cluster = self.find(embeddings[i], previous, similarity, theta_sim)
-            if cluster is None:
-                cluster = self.create(tau, i, parent, parent_at)
-                self.clusters[cluster].embedding = embeddings[i]
-                parent = cluster
+            previous = tau.clusters[i - 1]
+            v = self.find(embeddings[i], previous, similarity, theta_sim)
+            if v is None:
+                v = self.create(tau, i, parent_at, embeddings[i])
                 parent_at = i
-            self.clusters[cluster].visits += 1
-            if cluster != previous:
-                self.add_arc(previous, cluster, visits=1)
-            tau.clusters.append(cluster)
+            self.clusters[v].visits += 1
+            if v != previous:
+                self.add_arc(previous, v, visits=1)
+            tau.clusters.append(v)
 
     def find(self, e_i, previous, similarity, theta_sim):
         """The cluster to which s_i belongs: the most similar of the previous one and those adjacent
@@ -700,27 +695,27 @@ class Graph:
             found = self.most_similar(list(self.clusters), e_i, similarity, theta_sim)
         return found
 
-    def create(self, tau, i, parent, parent_at):
-        """Make a cluster of state i of tau, and its arc to the parent, whose centre is state
-        parent_at of tau (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
-        new = self.created
-        self.created += 1
+    def create(self, tau, i, parent_at, e_i):
+        """Make a cluster of state i of tau, embedded as e_i (d,), and its arc to the parent, whose
+        centre is state parent_at of tau (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
+        v = self.next_number
+        self.next_number += 1
         prefix = tau.frames[parent_at : i + 1].copy()  # a view would keep the whole of tau
         actions = b"".join(tau.actions[parent_at + 1 : i + 1])
-        self.clusters[new] = Cluster(prefix[-1], tau.snapshots[i])
-        self.adjacent[new] = set()
-        self.E_parent[new] = ParentArc(parent, prefix, actions)
-        return new
+        self.clusters[v] = Cluster(prefix[-1], tau.snapshots[i])
+        self.embeddings[v] = e_i
+        self.adjacent[v] = set()
+        self.E_parent[v] = ParentArc(tau.clusters[parent_at], prefix, actions)
+        return v
 
     def add_arc(self, start, end, visits):
-        """Count so many crossings of the arc (start, end) (S4.2-10)."""
+        """Add so many visits to the arc (start, end) (S4.2-10)."""
         self.arcs[start, end] = self.arcs.get((start, end), 0) + visits
         self.adjacent[start].add(end)
         self.adjacent[end].add(start)
 
     def lineage(self, v):
-        """From a child of the initial cluster down to v, each the parent of the next; empty for the
-        initial cluster itself (S4.2-19)."""
+        """v and its ancestors but for the initial cluster, oldest first (S4.2-19)."""
         line = []
         while v != 0:
             line.append(v)
@@ -728,71 +723,78 @@ class Graph:
         return line[::-1]
 
     def full_prefix(self, v):
-        """The states s_init ... s on the way to the centre s of v, in the order of time; empty for
-        the initial cluster (S4.2-21)."""
-        states = []
+        """The frames of s_init ... s on the way to the centre s of v, in the order of time; empty
+        for the initial cluster (S4.2-21)."""
+        if v == 0:
+            return []
+        frames = [self.clusters[0].frame]
         for u in self.lineage(v):
-            del states[-1:]  # the parent's centre, with which the next prefix begins
-            states += list(self.E_parent[u].prefix)
-        return states
+            frames += list(self.E_parent[u].prefix[1:])  # without the parent's centre
+        return frames
 
     def actions_to(self, v):
         """The actions that lead from s_init to the centre of v: pi^p of section 3.2 (S3.2-03)."""
         return b"".join(self.E_parent[u].actions for u in self.lineage(v))
 
     def merge(self, similarity, theta_merge):
-        """Test all pairs: in the order of creation, each cluster merges into the most similar
-        surviving earlier one with R(earlier, later) > theta_merge (S4.2-24, S4.2-25, R14). The
+        """In the order of creation, each cluster merges into the most similar surviving earlier one
+        with R(earlier, later) > theta_merge (S4.2-24, S4.2-25; our reading of all pairs, R14). The
         earlier one keeps its centre (S4.2-28) and inherits visits (S4.2-27) and arcs. Returns
         {later: earlier}."""
         merged = {}
         survivors = [0]
         for later in list(self.clusters)[1:]:
-            centre = self.clusters[later].embedding
-            earlier = self.most_similar(survivors, centre, similarity, theta_merge)
+            e_later = self.embeddings[later]
+            earlier = self.most_similar(survivors, e_later, similarity, theta_merge)
             if earlier is None:
                 survivors.append(later)
             else:
                 merged[later] = earlier
         for later, earlier in merged.items():
-            self.clusters[earlier].visits += self.clusters.pop(later).visits
-        self.redirect_arcs(merged)
+            absorbed = self.clusters.pop(later)
+            self.clusters[earlier].visits += absorbed.visits
+        self.redirect_arcs(self.arcs, merged)
         # Of E_parent only the lineages of living clusters are kept (R15; S4.2-29).
         needed = {u for v in self.clusters for u in self.lineage(v)}
         self.E_parent = {v: arc for v, arc in self.E_parent.items() if v in needed}
         return merged
 
-    def redirect_arcs(self, merged):
+    def redirect_arcs(self, arcs, merged):
         """Whatever arc was incident to a cluster is incident to the one it merged into; between the
         two there is none (S4.2-26)."""
-        old_arcs = self.arcs
         self.arcs = {}
         self.adjacent = {v: set() for v in self.clusters}
-        for (start, end), visits in old_arcs.items():
+        for (start, end), visits in arcs.items():
             start = merged.get(start, start)
             end = merged.get(end, end)
             if start != end:
                 self.add_arc(start, end, visits)
 
     def state_dict(self):
-        """G without its embeddings, which each iteration makes anew."""
-        clusters = self.clusters.items()
-        parents = self.E_parent.items()
+        """G without its embeddings, which each iteration makes anew. Frames are tensors: PyTorch
+        loads no arrays with weights_only."""
+        clusters = {}
+        for v, cluster in self.clusters.items():
+            clusters[v] = (torch.from_numpy(cluster.frame), cluster.snapshot, cluster.visits)
+        E_parent = {}
+        for v, arc in self.E_parent.items():
+            E_parent[v] = (arc.parent, torch.from_numpy(arc.prefix), arc.actions)
         return {
-            "clusters": {v: (torch.from_numpy(c.frame), c.snapshot, c.visits) for v, c in clusters},
+            "clusters": clusters,
             "arcs": dict(self.arcs),
-            "E_parent": {v: (a.parent, torch.from_numpy(a.prefix), a.actions) for v, a in parents},
-            "created": self.created,
+            "E_parent": E_parent,
+            "next_number": self.next_number,
         }
 
     def load_state_dict(self, state):
-        clusters = state["clusters"].items()
-        parents = state["E_parent"].items()
-        self.clusters = {v: Cluster(s.numpy(), snap, visits) for v, (s, snap, visits) in clusters}
-        self.E_parent = {v: ParentArc(parent, s.numpy(), a) for v, (parent, s, a) in parents}
-        self.created = state["created"]
-        self.arcs = state["arcs"]
-        self.redirect_arcs({})  # which makes `adjacent`
+        self.clusters = {}
+        for v, (frame, snapshot, visits) in state["clusters"].items():
+            self.clusters[v] = Cluster(frame.numpy(), snapshot, visits)
+        self.E_parent = {}
+        for v, (parent, prefix, actions) in state["E_parent"].items():
+            self.E_parent[v] = ParentArc(parent, prefix.numpy(), actions)
+        self.next_number = state["next_number"]
+        self.redirect_arcs(state["arcs"], merged={})
 
 
 # ------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
@@ -808,9 +810,9 @@ class RND(nn.Module):
         layers = SMALL if config.small_networks else NATURE
         self.batch_size = config.rnd_batch
         self.device = device
-        self.target = convolutions(layers, shape, d, batch_norm=False)
+        self.target = conv_encoder(layers, shape, d, batch_norm=False)
         self.predictor = nn.Sequential(
-            convolutions(layers, shape, d, batch_norm=False),
+            conv_encoder(layers, shape, d, batch_norm=False),
             nn.ReLU(),
             nn.Linear(d, d),
             nn.ReLU(),
@@ -846,17 +848,16 @@ class RND(nn.Module):
         return (self.errors(frames) - recent.mean()) / (recent.std() + 1e-8)
 
     def fit(self, trajectories, rng):
-        """Update the pixels' statistics, train the predictor, one pass over all states of
-        trajectories (T, H, W), and keep the errors that it then has, by which the next iterations'
-        rewards are scaled. Returns the mean loss."""
+        """One pass over the frames of trajectories, (T, H, W) each; before it their statistics are
+        updated. The errors after it scale the next iterations' rewards (R4). Returns the mean
+        loss."""
         for frames in trajectories:
             self.pixels.update(frames)
         states = [frame for frames in trajectories for frame in frames]
+        losses = []
         order = rng.permutation(len(states))
-        losses = [
-            self.update(np.stack([states[k] for k in batch]))
-            for batch in progress(batches(order, self.batch_size), "train RND")
-        ]
+        for batch in progress(batches(order, self.batch_size), "train RND"):
+            losses.append(self.update(np.stack([states[k] for k in batch])))
         # Taken after the learning: before it, the large errors of one new room would hide the next.
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
@@ -864,7 +865,7 @@ class RND(nn.Module):
     def update(self, frames):
         """One step of the predictor on frames (B, H, W). Returns the mean error before it."""
         loss = self(frames).mean()
-        descend(self.optimiser, loss, "RND")
+        gradient_step(self.optimiser, loss, "RND")
         return loss.item()
 
     def get_extra_state(self):
@@ -891,25 +892,26 @@ class BasicBlock(nn.Module):
     def __init__(self, inputs, width, stride=1):
         super().__init__()
         self.residual = nn.Sequential(
-            *convolution(inputs, width, 3, stride, 1),
+            *conv_norm(inputs, width, 3, stride, 1),
             nn.ReLU(inplace=True),
-            *convolution(width, width, 3, 1, 1),
+            *conv_norm(width, width, 3, 1, 1),
         )
         self.shortcut = nn.Sequential()  # the identity
         if stride > 1:
-            self.shortcut = nn.Sequential(*convolution(inputs, width, 1, stride, 0))
+            self.shortcut = nn.Sequential(*conv_norm(inputs, width, 1, stride, 0))
 
     def forward(self, x):
         return F.relu(self.residual(x) + self.shortcut(x), inplace=True)
 
 
 class ResNet18(nn.Module):
-    """17 convolutions and a linear layer (He et al. 2016): (B, C, H, W) -> (B, out)."""
+    """17 convolutions, shortcuts not counted, and a linear layer (He et al. 2016): (B, C, H, W) ->
+    (B, out)."""
 
     def __init__(self, channels, out):
         super().__init__()
         self.layers = nn.Sequential(
-            *convolution(channels, 64, 7, 2, 3),
+            *conv_norm(channels, 64, 7, 2, 3),
             nn.ReLU(inplace=True),
             nn.MaxPool2d(3, 2, padding=1),
             BasicBlock(64, 64),
@@ -929,8 +931,8 @@ class ResNet18(nn.Module):
         return self.linear(x.mean((2, 3)))
 
 
-def convolution(inputs, width, kernel, stride, padding):
-    """A convolution with batch normalisation, whose bias serves both."""
+def conv_norm(inputs, width, kernel, stride, padding):
+    """A convolution and its batch normalisation, which has the bias."""
     conv = nn.Conv2d(inputs, width, kernel, stride, padding, bias=False)
     return [conv, nn.BatchNorm2d(width)]
 
@@ -940,7 +942,7 @@ NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))
 SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))
 
 
-def convolutions(layers, shape, out, batch_norm):
+def conv_encoder(layers, shape, out, batch_norm):
     """A stack of convolutions and a linear layer, for frames of a shape: (B, C, H, W) -> (B,
     out)."""
     modules = []
@@ -952,14 +954,15 @@ def convolutions(layers, shape, out, batch_norm):
         modules.append(nn.ReLU(inplace=True))
         channels = width
     modules.append(nn.Flatten())
+    example = torch.zeros(1, channels_of(shape), *shape[:2])
     try:
-        sizes = nn.Sequential(*modules).eval()(torch.zeros(1, channels_of(shape), *shape[:2])).shape
+        features = nn.Sequential(*modules).eval()(example)  # batch normalisation learns nothing
     except RuntimeError:
         raise InputError(
             f"frames of {shape[0]} x {shape[1]} pixels are too small for the network: "
             "make them larger, or set small_networks"
         ) from None
-    return nn.Sequential(*modules, nn.Linear(sizes[1], out))
+    return nn.Sequential(*modules, nn.Linear(features.shape[1], out))
 
 
 def dense(inputs, outputs):
@@ -992,26 +995,28 @@ def channels_first(x):
     return x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
 
 
+# -------------------------------------------------------------------- what several parts use
+
+
 def in_parts(frames, size=512):
     """Frames in parts that fit into memory at once."""
     return [frames[k : k + size] for k in range(0, len(frames), size)]
 
 
 def batches(items, size):
-    """Shuffled items in batches of nearly equal sizes, at most `size`."""
+    """Items, already shuffled, in batches of nearly equal sizes, at most `size`."""
     count = math.ceil(len(items) / size)
     return [items[k::count] for k in range(count)]
 
 
-def descend(optimiser, loss, name, max_norm=math.inf):
-    """One step down the loss, its gradient at most max_norm long. InputError: the loss is infinite
-    or no number."""
+def gradient_step(optimiser, loss, name, max_norm=math.inf):
+    """One step down the loss, its gradient at most max_norm long. Raises InputError if the loss is
+    infinite or no number."""
     if not math.isfinite(loss.item()):
         raise InputError(f"the loss of {name} is {loss.item()}: give a lower learning rate")
     optimiser.zero_grad()
     loss.backward()
-    weights = [weight for group in optimiser.param_groups for weight in group["params"]]
-    nn.utils.clip_grad_norm_(weights, max_norm)
+    nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], max_norm)
     optimiser.step()
 
 
@@ -1021,9 +1026,14 @@ def check_budget(algorithm):
         raise InputError(f"the budget of {budget:,} steps is spent: give more steps")
 
 
+def full_coverage(env):
+    """The number of units of full coverage; None where it is unknown."""
+    return getattr(env, "full_coverage", None)
+
+
 def progress_metrics(algorithm):
     """Where a run stands, and %Cov: visited units of all, where these are known (5; S5-03)."""
-    full = getattr(algorithm.env, "full_coverage", None)
+    full = full_coverage(algorithm.env)
     units = len(algorithm.discovered)
     return {
         "iteration": algorithm.iteration,
@@ -1049,7 +1059,7 @@ def load_statistics(statistics, state):
     statistics.count = state["count"]
 
 
-def progress(items=None, what="", total=None):
+def progress(items, what, total=None):
     """A bar over a long loop; silent where the output is no terminal."""
     return tqdm(items, desc=what, total=total, leave=False, disable=None)
 
@@ -1154,7 +1164,7 @@ class ICM(nn.Module):
         layers = SMALL if config.small_networks else NATURE
         self.actions = actions
         self.device = device
-        self.encoder = convolutions(layers, shape, d, batch_norm=False)
+        self.encoder = conv_encoder(layers, shape, d, batch_norm=False)
         self.inverse_model = perceptron(2 * d, config.head_width, actions)
         self.forward_model = perceptron(d + actions, config.head_width, d)
         initialise(self, config.seed, 2)
@@ -1185,7 +1195,7 @@ class ICM(nn.Module):
         name."""
         inverse, forward = self.losses(before, actions, after)
         loss = (1 - self.BETA) * inverse.mean() + self.BETA * forward.mean()
-        descend(self.optimiser, loss, "ICM")
+        gradient_step(self.optimiser, loss, "ICM")
         return {"inverse_loss": inverse.mean().item(), "forward_loss": forward.mean().item()}
 
     def get_extra_state(self):
@@ -1234,7 +1244,7 @@ class PPO(Baseline):
         width = config.head_width
         layers = SMALL if config.small_networks else NATURE
         with torch.random.fork_rng(devices=[]):
-            encoder = convolutions(layers, shape, width, batch_norm=False)
+            encoder = conv_encoder(layers, shape, width, batch_norm=False)
             head = nn.Linear(width, self.actions + 1)  # the logits of the policy, and the value
             self.network = nn.Sequential(encoder, nn.ReLU(), head)
             if method == "rnd":
@@ -1322,7 +1332,7 @@ class PPO(Baseline):
         value_loss = (values - returns).square().mean()
         entropy = -(log_p.exp() * log_p).sum(1).mean()
         loss = self.VALUE * value_loss - gain - self.ENTROPY * entropy
-        descend(self.optimiser, loss, "PPO")
+        gradient_step(self.optimiser, loss, "PPO")
         return {"value_loss": value_loss.item(), "entropy": entropy.item()}
 
     def state_dict(self):
@@ -1655,10 +1665,6 @@ def megabytes(algorithm, iteration):
     return size / 2**20
 
 
-def full_coverage(env):
-    return getattr(env, "full_coverage", None)
-
-
 def unit_name(env):
     return getattr(env, "unit_name", "units")
 
@@ -1719,7 +1725,7 @@ def draw(run):
 
 def run_figures(a):
     """File name -> figure, of an algorithm as it stands."""
-    figures = {"coverage.png": curves_figure({"": [a.discovered]}, a.env, a.config)}
+    figures = {"coverage.png": curves_figure({"coverage": [a.discovered]}, a.env, a.config)}
     level = Level(a.env, a.discovered)
     if level.boxes:
         title = f"{len(a.discovered)} {unit_name(a.env)} after {a.steps:,} steps (red: not visited)"

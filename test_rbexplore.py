@@ -1,8 +1,10 @@
 """Tests. Those of a statement of the paper carry its number: S4.2-19 is `pytest -k S4_2_19`; those
 of a reading carry R and its number. A frame often holds a number: it is its own ground truth."""
 
+import contextlib
 import functools
 import gzip
+import io
 import json
 import math
 import multiprocessing
@@ -62,7 +64,7 @@ from rbexplore import (
 
 torch.set_num_threads(1)  # networks this small are faster so
 HERE = pathlib.Path(__file__).parent
-TINY = replace(MAZE, steps=2500, pretrain_steps=400, M=4, L=3, trajectory_steps=40, merge_every=2)
+TINY = replace(MAZE, steps=1200, pretrain_steps=400, M=4, L=3, trajectory_steps=40, merge_every=2)
 
 # ------------------------------------------------------------------------------------------ helpers
 
@@ -222,7 +224,7 @@ def restarted(env_fn=Grid, **changes):
 @pytest.fixture(scope="module")
 def maze_run():
     """A run on the maze, with merges, and its iterations."""
-    a = explorer(CountingMaze, steps=4000, beta=1.0)
+    a = explorer(CountingMaze, steps=2000, beta=1.0)
     a.env.steps_made = 0
     iterations = []
     while a.steps < a.config.steps:
@@ -241,7 +243,7 @@ def own(pair, trajectories):
 def test_S3_2_02_a_rollback_costs_no_step(maze_run):
     a, iterations = maze_run
     walked = sum(len(t.units) for i in iterations for t in i.trajectories + i.additional)
-    assert a.env.steps_made == walked == a.steps == 4000
+    assert a.env.steps_made == walked == a.steps == 2000
 
 
 def test_S3_2_03_the_stored_actions_lead_from_s_init_to_every_centre(maze_run):
@@ -257,7 +259,7 @@ def test_S3_2_03_the_stored_actions_lead_from_s_init_to_every_centre(maze_run):
 
 
 def test_S3_2_03_actions_across_blank_frames_are_kept():
-    a = restarted(steps=1500, theta_sim=0.95, merge=False).run()
+    a = restarted(theta_sim=0.95, merge=False).run()
     arcs = a.graph.E_parent.values()
     assert any(len(arc.actions) > len(arc.prefix) - 1 for arc in arcs)
     table, good = verify(a)
@@ -277,16 +279,9 @@ def test_S4_01_step_1_is_M_trajectories_from_the_sampled_centres():
     for t in trajectories:
         assert np.array_equal(t.frames[0], clusters[t.start].frame)
         assert t.snapshots[0] == clusters[t.start].snapshot
-
-
-def test_S4_01_what_travels_to_a_worker_is_frame_and_snapshot_alone():
-    a = restarted(Maze)
-    a.iterate()
-    starts = []
-    collect = a.collect
-    a.collect = lambda states, *rest: starts.extend(states) or collect(states, *rest)
-    a.iterate()
-    assert starts and all(type(start) is State for start in starts)
+        walked = a.graph.full_prefix(t.start)
+        assert len(t.prefix) == len(walked) and all(map(np.array_equal, t.prefix, walked))
+    assert any(t.prefix for t in trajectories)
 
 
 def test_an_interrupted_training_leaves_R_in_evaluation_mode():
@@ -309,8 +304,7 @@ def test_S4_01_a_rollback_to_another_frame_is_an_error():
 
 
 def test_S4_02_pairs_are_made_of_exploration_and_of_additional_trajectories(maze_run):
-    a, iterations = maze_run
-    both = [i for i in iterations if i.additional][0]
+    both = next(i for i in maze_run[1] if i.additional)
     assert sum(own(pair, both.trajectories) for pair in both.pairs) > 50
     for t in both.additional:
         assert sum(own(pair, [t]) for pair in both.pairs) >= len(t.frames)
@@ -359,12 +353,12 @@ def test_S4_03_states_are_assigned_by_the_R_just_trained():
         embeddings = a.similarity.embed(t.frames)
         for k in range(1, len(t.frames)):
             cluster = a.graph.clusters[t.clusters[k]]
-            R = a.similarity.score(cluster.embedding[None], embeddings[k])[0]
+            R = a.similarity.score(a.graph.embeddings[t.clusters[k]][None], embeddings[k])[0]
             own_centre = np.array_equal(cluster.frame, t.frames[k])
             assert R > 0.5 or own_centre
     fresh = a.similarity.embed(np.stack([v.frame for v in a.graph.clusters.values()]))
-    for v, embedding in zip(a.graph.clusters.values(), fresh, strict=True):
-        assert torch.allclose(v.embedding, embedding, atol=1e-4)
+    for v, embedding in zip(a.graph.clusters, fresh, strict=True):
+        assert torch.allclose(a.graph.embeddings[v], embedding, atol=1e-4)
 
 
 def test_S4_05_novelty_is_told_by_weights_from_before_and_learns_exploration_alone(monkeypatch):
@@ -416,6 +410,7 @@ def test_S4_07_no_reward_is_used():
 
 def test_S4_1_01_R_is_in_0_to_1_and_depends_on_the_pair_alone():
     model = SimilarityModel(MAZE, (32, 32))
+    assert not model.training
     x = pictures(40)
     model.fit([(x[k], x[-k], k % 2) for k in range(20)], np.random.default_rng(0))
     assert not model.training
@@ -487,6 +482,16 @@ def test_rates_are_shares_of_each_class_at_a_threshold_of_a_half_of_at_most_1000
     assert seen == [8, 8, 1000, 1000]
 
 
+def test_the_rates_are_of_pairs_that_R_has_not_yet_seen():
+    a = restarted(Maze)
+    calls = []
+    a.similarity = Stub(tens)
+    a.similarity.rates = lambda pairs, rng: calls.append("rates") or (0.25, 0.75)
+    a.similarity.fit = lambda pairs, rng: calls.append("fit") or 3.0
+    assert a.train_similarity([], None) == {"r_tpr": 0.25, "r_tnr": 0.75, "r_loss": 3.0}
+    assert calls == ["rates", "fit"]
+
+
 def test_S4_1_08_the_loss_is_binary_cross_entropy():
     model = SimilarityModel(MAZE, (32, 32)).train()
     x = pictures(16)
@@ -536,6 +541,27 @@ def test_S4_1_09_R29_the_prefix_of_an_additional_trajectory_goes_on_to_its_novel
     before = [0, 1, 2] if start else []
     assert numbers_of(walked.prefix) == [*before, *range(1000, 1008)]
     assert walked.start == start
+
+
+def test_S4_1_09_R29_additional_trajectories_have_pairs_with_their_prefix():
+    a = restarted(Maze, beta=2.5, L=5)
+    a.novelty.reward = lambda frames: np.where([number(f) == 1020 for f in frames], 3.0, 0.0)
+    a.collect = lambda states, *rest: [tau([1020, *range(2000, 2009)]) for _ in states]
+    pairs, _ = a.make_pairs([tau(range(1000, 1030))], np.random.default_rng(0))
+    found = [(i, y) for i, j, y in numbered(pairs) if i >= 2000 and j < 1020]
+    assert found == [(i, 0) for i in range(2000, 2009)]
+
+
+def test_S4_1_03_S4_1_04_S4_1_09_make_pairs_keeps_to_n_and_N_of_the_configuration():
+    a = restarted(Maze, n=4, N=12)
+    a.novelty.reward = lambda frames: np.zeros(len(frames))
+    t = tau(range(1000, 1030), prefix=range(971, 1001))  # the joined path is 971 ... 1029
+    pairs = []
+    for seed in range(40):
+        pairs += numbered(a.make_pairs([t], np.random.default_rng(seed))[0])
+    assert {abs(i - j) for i, j, y in pairs if y == 1} == {0, 1, 2, 3}
+    assert min(abs(i - j) for i, j, y in pairs if y == 0 and j >= 1000) == 13
+    assert min(i - j for i, j, y in pairs if j < 1000) == 13
 
 
 @pytest.mark.parametrize("P", [1, 4, 7, 8, 20])
@@ -588,6 +614,9 @@ def test_R19_R_trains_epochs_passes_each_over_all_and_returns_the_last_loss():
         assert sorted(numbers_of(s)) == list(range(20))
         assert all(number(a) % 2 == b for a, b in zip(s, y, strict=True))
     assert model.fit(pairs[::2], np.random.default_rng(0)) is None and len(batches) == 9
+    model.fit(pairs[:1] * 3 + pairs[1::2], np.random.default_rng(0))
+    odd = [{number(f) for s_1, _, _ in batches[k : k + 1] for f in s_1} for k in (9, 10, 11)]
+    assert odd[0] != odd[1] != odd[2]  # each pass has a draw of its own: R17
 
 
 # --------------------------------------------------- 4.2: the graph of clusters, prefixes and merge
@@ -759,18 +788,22 @@ def test_R6_before_the_first_training_nothing_is_novel():
 
 def test_R18_RND_learns_each_state_once_in_mixed_batches():
     rnd = RND(replace(MAZE, rnd_batch=8), (32, 32))
-    seen = []
-    rnd.update = lambda frames: seen.append(numbers_of(frames)) or 1.5
+    batches = []
+    counts = []
+
+    def update(frames):
+        batches.append(numbers_of(frames))
+        counts.append(rnd.pixels.count)
+        return float(len(batches))
+
+    rnd.update = update
     frames = [tau(range(20)).frames, tau(range(20, 30)).frames]
-    assert rnd.fit(frames, np.random.default_rng(0)) == 1.5
-    assert sorted(sum(seen, [])) == list(range(30)) and [len(batch) for batch in seen] == [
-        8,
-        8,
-        7,
-        7,
-    ]
-    assert sum(seen, []) != list(range(30))
-    assert rnd.pixels.count == pytest.approx(30, abs=0.01)
+    assert rnd.fit(frames, np.random.default_rng(0)) == 2.5  # the mean of 1, 2, 3, 4
+    learned = [k for batch in batches for k in batch]
+    assert [len(batch) for batch in batches] == [8, 8, 7, 7]
+    assert sorted(learned) == list(range(30)) and learned != list(range(30))
+    assert counts == pytest.approx([30] * 4, abs=0.01)  # the statistics come first
+    assert np.array_equal(rnd.recent_errors[-1], np.concatenate([rnd.errors(x) for x in frames]))
 
 
 def novel_where(a, wanted):
@@ -816,7 +849,7 @@ def test_S4_2_17_a_random_sample_of_B_of_at_most_L():
 def test_S4_2_18_additional_trajectories_serve_R_alone():
     found = []
     for L in (0, 20):
-        a = restarted(Maze, L=L, beta=0.5)
+        a = restarted(Maze, L=L, beta=0.5, steps=2500)
         a.similarity = Stub(lambda s, s_i: s == s_i)
         a.similarity.embed = lambda frames: torch.tensor([[float(f.sum())] for f in frames])
         for _ in range(3):
@@ -832,7 +865,7 @@ def test_S4_2_18_additional_trajectories_serve_R_alone():
 
 
 def test_R3_R5_additional_trajectories_are_short_and_of_this_iterations_states():
-    a = restarted(Maze, beta=0.0, L=50)
+    a = restarted(Maze, beta=0.0, L=50, steps=2500)
     for _ in range(3):
         i = a.iterate()
         states = {s for t in i.trajectories for s in t.snapshots}
@@ -894,7 +927,7 @@ def test_S4_2_24_merge_tests_all_pairs():
 
 def test_S4_2_25_merge_above_theta_merge_which_is_its_own():
     for theta_merge, merged in ((0.6, {1: 0}), (0.7, {}), (0.75, {})):
-        a = restarted(Maze, theta_merge=theta_merge, theta_sim=0.8)
+        a = restarted(Maze, theta_merge=theta_merge, theta_sim=0.1)
         a.graph = Graph(State(frame(0), b"0"))
         a.similarity = Stub(table({(0, 1): 0.7}))
         a.iteration = a.config.merge_every
@@ -932,6 +965,20 @@ def test_S4_2_28_S4_2_29_the_initial_cluster_stays_and_every_other_leads_to_it()
 def test_R15_lineages_without_a_living_descendant_are_dropped():
     graph, _ = merged_chain({(0, 4): 0.9, (1, 3): 0.9})
     assert set(graph.clusters) == {0, 1, 2} and set(graph.E_parent) == {1, 2}
+
+
+def test_R15_a_graph_that_merged_goes_on_from_its_state():
+    graph, _ = merged_chain({(0, 2): 0.9, (1, 3): 0.9})  # 0, 1 and 4 live
+    other = Graph(State(frame(9), b"9"))
+    other.load_state_dict(graph.state_dict())
+    stub = Stub(table({}))
+    for g in (graph, other):
+        g.embed_centres(stub)
+        g.add_trajectory(tau([4, 70, 80], start=4), stub, 0.5)
+    assert centres(other) == centres(graph) == {0: 0, 1: 1, 4: 4, 5: 70, 6: 80}
+    assert (other.arcs, other.adjacent) == (graph.arcs, graph.adjacent)
+    assert visits(other) == visits(graph)
+    assert numbers_of(other.full_prefix(6)) == [0, 1, 2, 3, 4, 70, 80]
 
 
 class Slow:
@@ -1061,6 +1108,9 @@ def test_S6_1_03_one_resnet18_embeds_a_frame_in_512():
     assert len(weighted) - len(shortcuts) == 18 and len(shortcuts) == 3
     assert sum(w.numel() for w in model.encoder.parameters()) == 11_432_896
     assert model.embed(pictures(2, size=96)).shape == (2, 512)
+    pool = model.encoder.layers[3]
+    assert isinstance(pool, nn.MaxPool2d)
+    assert (pool.kernel_size, pool.stride, pool.padding) == (3, 2, 1)
     x = torch.zeros(1, 1, 96, 96)
     sizes = []
     for layer in model.encoder.layers:
@@ -1205,6 +1255,15 @@ def test_S6_1_13_theta_sim_rises_from_0_linearly_in_pretraining(maze_run):
     assert [row["steps"] for row in rows if row["phase"] == "pretrain"][-1] == 400
 
 
+def test_S6_1_13_states_join_by_the_threshold_that_rises(monkeypatch):
+    used = []
+    add = Graph.add_trajectory
+    monkeypatch.setattr(Graph, "add_trajectory", lambda *x: used.append(x[3]) or add(*x))
+    a = explorer(Maze)
+    told = [a.iterate().metrics["theta_sim"] for _ in range(4)]
+    assert list(dict.fromkeys(used)) == told and told[0] == 0 < told[1] < told[2] < told[3]
+
+
 def test_S6_1_14_S6_1_15_at_the_restart_G_is_reset_and_R_and_RND_are_kept():
     a = explorer(Maze, merge=False, theta_sim=0.95)
     while a.steps < 400:
@@ -1268,6 +1327,12 @@ def test_each_seed_and_each_iteration_draws_anew():
     assert len(set(walks)) == 3
 
 
+def test_frames_are_embedded_in_parts_without_a_gap():
+    frames = np.arange(1300)
+    parts = rbexplore.in_parts(frames)
+    assert np.array_equal(np.concatenate(parts), frames) and max(map(len, parts)) <= 512
+
+
 def test_no_two_networks_begin_alike_be_it_of_one_seed_or_of_neighbours():
     first_layers = set()
     for seed in (0, 1):
@@ -1279,6 +1344,13 @@ def test_no_two_networks_begin_alike_be_it_of_one_seed_or_of_neighbours():
         first_layers |= {tuple(encoder[0].weight.flatten().tolist()) for encoder in encoders}
         assert not any(isinstance(m, nn.BatchNorm2d) for e in encoders[1:] for m in e.modules())
     assert len(first_layers) == 10
+
+
+def test_R18_adams_rate_is_that_of_the_configuration():
+    config = replace(AGENT, learning_rate=3e-4)
+    ppo = PPO(Corridor, config, "icm", "cpu")
+    for part in (SimilarityModel(config, (32, 32)), RND(config, (32, 32)), ppo, ppo.curiosity):
+        assert [group["lr"] for group in part.optimiser.param_groups] == [3e-4]
 
 
 def test_networks_begin_with_hes_weights_of_their_own():
@@ -1293,6 +1365,7 @@ def test_networks_begin_with_hes_weights_of_their_own():
     assert not any(w.requires_grad for w in rnd.target.parameters())
     kinds = [type(layer).__name__ for layer in rnd.target]
     assert kinds == ["Conv2d", "ReLU"] * 3 + ["Flatten", "Linear"]
+    assert [type(x).__name__ for x in rnd.predictor[1:]] == ["ReLU", "Linear"] * 2
     kinds = [type(layer).__name__ for layer in r.encoder]
     assert kinds == ["Conv2d", "BatchNorm2d", "ReLU"] * 3 + ["Flatten", "Linear"]
     convs = [m for m in RND(Config(), (96, 96)).target if isinstance(m, nn.Conv2d)]
@@ -1388,7 +1461,7 @@ def test_a_configuration_that_cannot_work_is_refused(changes, said):
 def test_a_loss_that_is_not_finite_is_one_clear_line(name):
     weight = nn.Parameter(torch.ones(1))
     with pytest.raises(InputError, match=f"the loss of {name} is nan.*learning rate"):
-        rbexplore.descend(torch.optim.Adam([weight]), (weight * math.nan).sum(), name)
+        rbexplore.gradient_step(torch.optim.Adam([weight]), (weight * math.nan).sum(), name)
 
 
 # ------------------------------------------------------------------------ 6.2: the methods compared
@@ -1437,19 +1510,66 @@ def test_S6_2_03_S6_2_04_every_method_stops_at_the_budget_and_covers_by_the_same
         a.iterate()
 
 
+@pytest.mark.parametrize("method", ["random", "rnd"])
+def test_S5_03_S6_2_04_a_compared_method_covers_at_the_step_that_arrives(method):
+    units = []
+
+    class Watched(Maze):
+        def unit(self):
+            return None if self.state.x == 3 else super().unit()
+
+        def step(self, action):
+            result = super().step(action)
+            units.append(self.unit())
+            return result
+
+    a = make_method(method, Watched, replace(AGENT, steps=700))
+    units.clear()  # of the contract's walk
+    while a.steps < 700:
+        a.iterate()
+    first = {(6, 1, 2): 0}
+    for step, unit in enumerate(units, 1):
+        if unit is not None:
+            first.setdefault(unit, step)
+    assert None in units and a.discovered == first
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_S3_2_01_every_method_checks_the_contract_and_seeds_its_environment(method):
+    with pytest.raises(InputError, match="gives another frame than the first time"):
+        make_method(method, lambda: without("draw"), AGENT)
+    seeds = set()
+
+    class Seeded(Maze):
+        def reset(self, *, seed=None, options=None):
+            seeds.add(seed)
+            return super().reset(seed=seed)
+
+    make_method(method, Seeded, replace(AGENT, seed=5, steps=100)).iterate()
+    assert seeds == {5}
+
+
 def test_S6_2_03_random_acts_uniformly_and_starts_anew_with_each_episode():
-    a = make_method("random", Corridor, AGENT)
-    resets = []
-    reset = a.env.reset
-    a.env.reset = lambda **named: resets.append(a.steps) or reset(**named)
-    a.iterate()
-    assert resets == [0, 40, 80, 120]  # M episodes of trajectory_steps
+    walks = []
+    for seed in (1, 2):
+        a = make_method("random", Maze, replace(AGENT, seed=seed, M=25))
+        resets = []
+        acted = []
+        a.reset = lambda resets=resets, acted=acted: resets.append(len(acted))
+        a.step = lambda action, acted=acted: acted.append(action) or (None, False)
+        for _ in range(2):
+            a.iterate()
+        assert resets == list(range(0, 2000, 40))  # M episodes of trajectory_steps
+        counts = np.bincount(acted, minlength=7)
+        assert counts.min() > 220 and counts.max() < 360
+        walks += [tuple(acted[:1000]), tuple(acted[1000:])]
+    assert len(set(walks)) == 4  # each seed and each iteration draws anew
 
 
 @pytest.mark.parametrize(("bonus", "loss"), [("rnd", "rnd_loss"), ("icm", "forward_loss")])
 def test_S6_2_03_a_bonus_and_its_loss_fall_on_what_was_seen(bonus, loss):
     a = PPO(Corridor, AGENT, bonus, "cpu")
-    before, after, new = (np.stack([frame(k + x) for k in range(40)]) for x in (0, 1, 600))
+    before, after = (np.stack([frame(k + x) for k in range(40)]) for x in (0, 1))
     actions = np.arange(40) % 2
     first = a.curiosity.bonus(before, actions, after).mean()
     losses = [a.curiosity.learn(before, actions, after)[loss] for _ in range(60)]
@@ -1461,9 +1581,12 @@ def test_S6_2_03_the_bonus_of_rnd_is_its_error_on_the_state_arrived_at():
     bonus = RNDBonus(MAZE, (32, 32))
     before, after = pictures(9), pictures(9, seed=1)
     told = bonus.bonus(before, np.zeros(9, int), after)
-    assert np.allclose(told, bonus.errors(after)) and bonus.pixels.count == pytest.approx(
-        9, abs=0.01
-    )
+    assert np.allclose(told, bonus.errors(after))
+    assert bonus.pixels.count == pytest.approx(9, abs=0.01)
+    learned = []
+    bonus.update = lambda frames: learned.append(frames) or 0.5
+    assert bonus.learn(before, np.zeros(9, int), after) == {"rnd_loss": 0.5}
+    assert learned[0] is after
 
 
 def test_S6_2_03_the_encoder_of_icm_learns_by_the_inverse_loss_alone():
@@ -1587,17 +1710,28 @@ def test_S6_2_03_actions_are_samples_of_the_policy():
     assert all(log_p == pytest.approx(math.log(p[action]), abs=1e-4) for action, log_p, _ in acted)
 
 
-def test_R27_a_rollout_is_learned_in_four_passes_of_four_minibatches():
-    a = PPO(Corridor, AGENT, "rnd", "cpu")
+def test_R27_a_rollout_is_learned_in_four_passes_of_four_minibatches_and_by_the_bonus_too():
+    a, twin = (PPO(Corridor, AGENT, "rnd", "cpu") for _ in range(2))
+    before, actions, after, log_p, values, last = twin.rollout(np.random.default_rng([0, 1]))
+    bonus = twin.scaled(twin.curiosity.bonus(before, actions, after))
+    advantages = advantages_of(bonus, values, last, 0.99, 0.95)
     seen = []
-    a.update = lambda frames, *rest: seen.append(numbers_of(frames)) or {}
-    a.curiosity.learn = lambda *batch: {"rnd_loss": 0.0}
-    a.rollout = lambda rng, rollout=a.rollout: seen.append(rollout(rng)) or seen[0]
+    learned = []
+    a.update = lambda *batch: seen.append(batch) or {}
+    a.curiosity.learn = lambda *batch: learned.append(batch) or {"rnd_loss": 0.0}
     a.iterate()
-    rollout = sorted(numbers_of(seen.pop(0)[0]))
-    assert [len(batch) for batch in seen] == [50] * 16
+    assert [len(batch[0]) for batch in seen] == [50] * 16
+    order = np.argsort(advantages)
     for k in range(0, 16, 4):
-        assert sorted(sum(seen[k : k + 4], [])) == rollout
+        joined = [np.concatenate(parts) for parts in zip(*seen[k : k + 4], strict=True)]
+        by_advantage = np.argsort(joined[3])
+        for part, expected in zip(joined, (before, actions, log_p, advantages), strict=False):
+            assert np.allclose(part[by_advantage], expected[order], atol=1e-5)
+        assert np.allclose(joined[4][by_advantage], (advantages + values)[order], atol=1e-5)
+    for batch, of_bonus in zip(seen, learned, strict=True):
+        assert np.array_equal(of_bonus[0], batch[0]) and np.array_equal(of_bonus[1], batch[1])
+        steps = [number(y) - number(x) for x, y in zip(batch[0], of_bonus[2], strict=True)]
+        assert set(steps) <= {-1, 0, 1}
 
 
 def test_R27_ppos_values_are_burdas():
@@ -1625,6 +1759,8 @@ def test_cells_are_equal_where_11_by_8_pixels_of_8_greys_are():
     assert cells.score(both, both[1]).tolist() == [0, 1]
     assert cells.embed(light).shape == (1, 88) and cells.embed(light).unique().tolist() == [6]
     assert cells.embed(np.full((1, 96, 96, 3), 255, np.uint8)).unique().tolist() == [7]
+    bands = (np.arange(96) // 12 * 32)[:, None].repeat(96, 1).astype(np.uint8)  # 8 of them
+    assert cells.embed(bands[None]).reshape(8, 11).tolist() == [[k] * 11 for k in range(8)]
 
 
 @pytest.mark.parametrize("method", ["rnd", "icm", "random", "cells"])
@@ -1990,15 +2126,15 @@ def check_replay(env, make, elsewhere, count, length):
 
 
 def test_S3_2_01_the_maze_replays_here_and_in_another_process(elsewhere):
-    check_replay(Maze(3), functools.partial(Maze, 3), elsewhere, count=200, length=12)
+    check_replay(Maze(3), functools.partial(Maze, 3), elsewhere, count=100, length=12)
 
 
 def test_S3_2_01_the_cartridge_replays_here_and_in_another_process(prince, rom, elsewhere):
-    check_replay(prince, functools.partial(PrinceOfPersia, rom), elsewhere, count=120, length=10)
+    check_replay(prince, functools.partial(PrinceOfPersia, rom), elsewhere, count=60, length=10)
 
 
 def test_S3_2_01_montezuma_replays_here_and_in_another_process(montezuma, elsewhere):
-    check_replay(montezuma, Montezuma, elsewhere, count=50, length=30)
+    check_replay(montezuma, Montezuma, elsewhere, count=25, length=30)
 
 
 # ---- the maze (5) --------------------------------------------------------------------------------
@@ -2712,7 +2848,7 @@ def test_frames_of_the_emulators_are_the_callers_own(prince):
 
 # -------------------------------------------------------------- the run folder and the command line
 
-SMALL_RUN = ["--steps=1500", "--pretrain-steps=300", "--M=4", "--L=3", "--trajectory-steps=40",
+SMALL_RUN = ["--steps=1000", "--pretrain-steps=300", "--M=4", "--L=3", "--trajectory-steps=40",
              "--merge-every=2", "--beta=1"]  # fmt: skip
 SCRIPT = rbexplore.__file__
 FIGURES = {"coverage.png", "coverage_map.png", "graph.png", "centres.png", "route.gif"}
@@ -2774,10 +2910,10 @@ def refused(capsys, argv, said, code=2):
 def finished(tmp_path_factory):
     """A run that was never interrupted."""
     folder = tmp_path_factory.mktemp("runs") / "whole"
-    with start("--env=maze", *SMALL_RUN, "--trace", f"--out={folder}") as process:
-        out, err = process.communicate()
-    assert process.returncode == 0, err
-    return folder, out
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(["--env=maze", *SMALL_RUN, "--trace", f"--out={folder}"]) == 0
+    return folder, said.getvalue()
 
 
 def test_a_run_folder_holds_all_that_the_readme_says(finished):
@@ -2791,12 +2927,12 @@ def test_a_run_folder_holds_all_that_the_readme_says(finished):
     assert heading.startswith(
         "iteration,phase,steps,units,coverage,theta_sim,clusters,added,merged"
     )
-    assert rows[-1].split(",")[2] == "1500"
+    assert rows[-1].split(",")[2] == "1000"
     config = json.loads((folder / "config.json").read_text())
     assert config["config"] == asdict(
         replace(
             MAZE,
-            steps=1500,
+            steps=1000,
             pretrain_steps=300,
             M=4,
             L=3,
@@ -2805,9 +2941,9 @@ def test_a_run_folder_holds_all_that_the_readme_says(finished):
             beta=1.0,
         )
     )
-    assert "187 tiles to cover; seed 0; 1,500 steps, 300 of them pretraining" in out
+    assert "187 tiles to cover; seed 0; 1,000 steps, 300 of them pretraining" in out
     assert re.search(
-        r"1,500 steps, \d+ s: \d+ tiles of 187, [\d.]+ %; steps to 50 %: not reached", out
+        r"1,000 steps, \d+ s: \d+ tiles of 187, [\d.]+ %; steps to 50 %: not reached", out
     )
 
 
@@ -2870,7 +3006,7 @@ def test_a_run_killed_at_any_write_can_be_resumed_or_begun(finished, tmp_path, m
             write(path, content)
 
         monkeypatch.setattr(rbexplore, "write_atomically", write_or_die)
-        argv = [*SMALL_RUN, "--steps=500", "--no-figures"]
+        argv = [*SMALL_RUN, "--steps=320", "--no-figures"]
         with pytest.raises(SystemExit):
             main([*argv, f"--out={folder}"])
         monkeypatch.setattr(rbexplore, "write_atomically", write)
@@ -2897,17 +3033,42 @@ def test_a_resumed_run_writes_what_is_missing_and_keeps_its_trace(finished, tmp_
     assert outcome(folder) == before
 
 
-def test_ctrl_c_exits_with_130_draws_and_can_be_resumed(finished, tmp_path):
+def test_ctrl_c_exits_with_130_draws_and_can_be_resumed(finished, tmp_path, capsys, monkeypatch):
     folder = tmp_path / "stopped"
-    with start(*SMALL_RUN, "--trace", f"--out={folder}") as process:
-        wait_for_rows(process, folder, 3)
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate()
-    assert process.returncode == 130 and "Traceback" not in err
-    assert f"go on with: python rbexplore.py --resume {folder}" in out
+    train_novelty = RbExplore.train_novelty
+
+    def interrupted(algorithm, *arguments):
+        if algorithm.iteration == 4:
+            signal.raise_signal(signal.SIGINT)
+        return train_novelty(algorithm, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RbExplore, "train_novelty", interrupted)
+        assert main([*SMALL_RUN, "--trace", f"--out={folder}"]) == 130
+    assert f"go on with: python rbexplore.py --resume {folder}" in capsys.readouterr().out
     assert {path.name for path in folder.iterdir()} >= FIGURES
+    assert len(rows_of(folder)) == 1 + 3
     assert main(["--resume", str(folder), "--no-figures"]) == 0
     assert outcome(folder) == outcome(finished[0])
+
+
+def test_after_ctrl_c_the_same_run_goes_on_as_if_never_stopped(tmp_path, monkeypatch):
+    config = replace(TINY, steps=700)
+    whole, stopped = (Run(tmp_path / name, RbExplore(Maze, config)).begin() for name in "ab")
+    whole.go()
+    train_novelty = RbExplore.train_novelty
+
+    def interrupted(algorithm, *arguments):
+        result = train_novelty(algorithm, *arguments)
+        if algorithm.iteration == 3:
+            raise KeyboardInterrupt
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RbExplore, "train_novelty", interrupted)
+        assert not stopped.go() and stopped.algorithm.iteration == 2
+    assert stopped.go()
+    assert plain(stopped.algorithm.state_dict()) == plain(whole.algorithm.state_dict())
 
 
 def test_a_folder_of_something_else_is_refused_and_untouched(finished, tmp_path, capsys):
@@ -2936,9 +3097,9 @@ def test_stop_at_full_ends_a_run_that_has_covered_all(tmp_path, capsys, monkeypa
     argv = [*SMALL_RUN, "--no-figures", f"--out={folder}"]
     assert main([*argv, "--stop-at-full"]) == 0
     assert rows_of(folder)[-1].split(",")[4] == "1.0"
-    assert int(rows_of(folder)[-1].split(",")[2]) < 1500 == MAZE.steps - 98_500
+    assert int(rows_of(folder)[-1].split(",")[2]) < 1000
     assert main(["--resume", str(folder), "--no-figures"]) == 0
-    assert rows_of(folder)[-1].split(",")[2] == "1500"
+    assert rows_of(folder)[-1].split(",")[2] == "1000"
 
 
 @pytest.mark.parametrize("what", ["nothing", "centre", "snapshot", "actions"])
@@ -3045,6 +3206,15 @@ def test_bad_input_is_one_line_and_nothing_is_made(tmp_path, capsys, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_of_another_version_goes_on_with_a_note(finished, tmp_path, capsys):
+    for name in ("config.json", "metrics.csv", "checkpoint.pt", "trace.jsonl"):
+        (tmp_path / name).write_bytes((finished[0] / name).read_bytes())
+    config = tmp_path / "config.json"
+    config.write_text(config.read_text().replace(np.__version__, "0.0"))
+    assert main(["--resume", str(tmp_path), "--no-figures"]) == 0
+    assert "was begun with" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("option", ["--level=1", "--M=4", "--method=rnd", "--out=x", "--threads=2"])
 def test_a_run_that_was_begun_keeps_its_options(finished, capsys, option):
     refused(capsys, ["--resume", finished[0], option], f"{option.split('=')[0]} does not go with")
@@ -3149,16 +3319,50 @@ def test_S6_2_06_the_map_is_that_of_the_best_run_by_final_coverage():
     assert rbexplore.best(runs) == runs[1]
 
 
+def test_S6_2_06_a_report_has_the_curve_of_each_run_and_the_map_of_each_methods_best(
+    tmp_path, monkeypatch
+):
+    maps = []
+    draw_maps = rbexplore.maps_figure
+    monkeypatch.setattr(rbexplore, "maps_figure", lambda *x: maps.append(x[1]) or draw_maps(*x))
+    units = sorted(Maze().reachable())
+    few = {unit: 10 * k for k, unit in enumerate(units[:5])}
+    many = {unit: 10 * k for k, unit in enumerate(units[:50])}
+    found = {"rnd": {0: few, 1: many}, "icm": {0: few}}
+    rbexplore.report(options("--experiment=methods", f"--out={tmp_path}"), Maze(), MAZE, found)
+    assert list(maps[0].values()) == [many, few] and (tmp_path / "maps.png").exists()
+    rows = (tmp_path / "curves.csv").read_text().splitlines()
+    ends = [row for row in rows if ",100000," in row]
+    assert ends == ["rnd,0,100000,2.6738", "rnd,1,100000,26.7380", "icm,0,100000,2.6738"]
+
+
+def test_S6_2_06_a_map_colours_tiles_by_their_first_visit_and_crosses_out_the_rest():
+    level = rbexplore.Level(Maze(), {})
+    first, second = list(level.boxes)[:2]
+    figure = rbexplore.maps_figure(level, {"run": {first: 5, second: 90}}, 100)
+    (tiles,) = figure.axes[0].collections
+    assert tiles.get_array().tolist() == [5, 90] and tiles.get_clim() == (0, 100)
+    assert len(figure.axes[0].lines) == 187 - 2
+
+
 def test_S5_03_a_curve_counts_the_units_of_its_step():
     curve = rbexplore.coverage_curve(
         {"a": 0, "b": 10, "c": 20}, np.array([0, 9, 10, 19, 20, 30]), 4
     )
     assert curve.tolist() == [25, 25, 50, 50, 75, 75]
     assert rbexplore.steps_to({k: 10 * k for k in range(9)}, 10) == {50: 40, 90: 80, 100: None}
+    assert rbexplore.steps_to({k: 10 * k for k in range(9)}, 9) == {50: 40, 90: 80, 100: 80}
 
 
 def options(*argv):
     return rbexplore.parser().parse_args(list(argv))
+
+
+def test_the_environment_gets_its_options():
+    settings = rbexplore.settings_of(options("--frame-size=48", "--level=2"))
+    assert rbexplore.options_of(settings) == {"level": 2, "frame_size": 48}
+    settings = rbexplore.settings_of(options("--env=pop", "--rom=/a.nes", "--state=/b"))
+    assert rbexplore.options_of(settings) == {"rom": "/a.nes", "state": "/b", "frame_size": 96}
 
 
 @pytest.mark.parametrize(
@@ -3193,7 +3397,7 @@ def test_S6_2_03_an_experiment_does_all_methods_three_times_unless_told():
 
 
 def test_an_experiment_does_the_rest_names_failures_and_goes_on(tmp_path, capsys, monkeypatch):
-    argv = ["--experiment=ablation", "--seeds=1", *SMALL_RUN, "--steps=500", f"--out={tmp_path}"]
+    argv = ["--experiment=ablation", "--seeds=1", *SMALL_RUN, "--steps=320", f"--out={tmp_path}"]
     broken = tmp_path / "no-merge-0"
     broken.mkdir()
     (broken / "mine").write_text("not a run")
@@ -3209,7 +3413,8 @@ def test_an_experiment_does_the_rest_names_failures_and_goes_on(tmp_path, capsys
     assert outcome(tmp_path / "rbexplore-0") == first
     lines = (tmp_path / "curves.csv").read_text().splitlines()
     assert lines[0] == "variant,seed,steps,coverage" and len(lines) == 1 + 3 * 201
-    refused(capsys, [*argv, "--M=5"], "holds a run of another configuration")
+    for change in ("--M=5", "--steps=330"):
+        refused(capsys, [*argv, change], "holds a run of another configuration")
 
 
 def test_an_experiments_runs_end_with_it(tmp_path):
@@ -3238,6 +3443,21 @@ def test_a_warning_tells_where_R_finds_everything_new_or_known(tmp_path):
         assert f"R finds every state {said}" in run.line()
         run.rows = [row | {rate: 0.1, "phase": "pretrain"}]
         assert "warning" not in run.line()
+
+
+def test_the_metrics_are_what_the_iteration_did(maze_run):
+    clusters = 1
+    phase = "pretrain"
+    for i in maze_run[1]:
+        m = i.metrics
+        if m["phase"] != phase:  # G is reset
+            clusters = 1
+        phase = m["phase"]
+        clusters += m["added"] - len(i.merged)
+        assert (m["clusters"], m["merged"]) == (clusters, len(i.merged))
+        assert m["additional"] == len(i.additional)
+        novelty = np.concatenate([t.novelty for t in i.trajectories])
+        assert m["novel_share"] == np.mean(novelty > 1.0)
 
 
 def test_memory_counts_frames_and_snapshots_of_the_iteration_and_of_G():
@@ -3274,7 +3494,7 @@ def test_the_examples_of_the_readme_run(tmp_path):
     assert blocks
     for block in blocks:
         script = tmp_path / "example.py"
-        script.write_text(block.replace("10_000", "1_200").replace("1_000", "300"))
+        script.write_text(block.replace("10_000", "600").replace("1_000", "300"))
         env = os.environ | {"PYTHONPATH": str(HERE)}
         done = subprocess.run(
             [sys.executable, script], cwd=tmp_path, env=env, capture_output=True, text=True
