@@ -617,7 +617,7 @@ def overlaps(pixels: int, size: int) -> np.ndarray:
 
 
 class EmulatorEnv(PersistentEnv):
-    """What the emulators share: preprocessing (6.1), snapshots (3.2), the end of an episode (R23).
+    """What the emulators share: frames (S5-01), snapshots (3.2), the end of an episode (R23).
 
     A frame is the last one of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8.
     The reward is 0.0. info holds the readings of RAM, and "blank": no pixel is lit (R24).

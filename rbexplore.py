@@ -18,7 +18,7 @@ An iteration has five steps (section 4). They are the five calls of `RbExplore.i
     R(s_1, s_2)         SimilarityModel              in [0, 1]: are the two states close in time?
     n, N                Config.n, Config.N           closer than n: similar; further than N: not
     G = (V, E)          Graph.clusters, Graph.arcs   clusters and the arcs between them
-    v = (s, snap)       Cluster                      a cluster is its centre
+    v = (s, snap)       Cluster                      a cluster is its centre; v is its number
     E_parent            Graph.E_parent               the arc from v to the cluster it came from
     theta_sim           Config.theta_sim             threshold of R to join a cluster
     theta_merge         Config.theta_merge           threshold of R to merge two clusters
@@ -207,10 +207,10 @@ class RbExplore:
             self.restart()
         self.iteration += 1
         # Made anew each iteration, so that a checkpoint needs no generator; one for each step that
-        # draws, so that what one draws does not shift the next.
+        # draws, so that what one step draws does not shift the next step.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
-        theta_sim = self.theta_sim()  # before any step is taken: it begins at 0 (S6.1-13)
+        theta_sim = self.theta_sim_now()  # before any step is taken: it begins at 0 (S6.1-13)
         first_new = self.graph.next_number
 
         trajectories = self.explore(rng_1)
@@ -247,7 +247,7 @@ class RbExplore:
         if self.initial_unit is not None:
             self.discovered[self.initial_unit] = self.steps
 
-    def theta_sim(self):
+    def theta_sim_now(self):
         """The threshold; in pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
         if not self.pretraining:
             return self.config.theta_sim
@@ -264,7 +264,7 @@ class RbExplore:
         trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
         for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the steps ended
             tau.start = v
-            tau.prefix = self.graph.full_prefix(v)
+            tau.full_prefix = self.graph.full_prefix(v)
         check_lengths(trajectories)
         return trajectories
 
@@ -280,7 +280,9 @@ class RbExplore:
         while len(trajectories) < len(starts) and self.steps < end:
             left = end - self.steps
             limit = min(max_steps, left)
-            fitting = left // limit  # walks that fit, if each takes all its steps
+            # Workers walk side by side, so only those are begun that fit at full length; what the
+            # shorter ones leave is for the next round.
+            fitting = left // limit
             first = len(trajectories)
             jobs = [(starts[k], seeds[k], limit) for k in range(first, len(starts))][:fitting]
             for tau in progress(walk_all(self, jobs), "walk", len(jobs)):
@@ -301,7 +303,7 @@ class RbExplore:
         # In a loop of its own: without it the other pairs are the same (S6.3-02).
         if self.config.prefix:
             for tau in trajectories + additional:
-                pairs += pairs_with_prefix(tau.frames, tau.prefix, self.config.N, rng)
+                pairs += pairs_with_prefix(tau.frames, tau.full_prefix, self.config.N, rng)
         return pairs, additional
 
     def walk_on_from_novel_states(self, trajectories, rng):
@@ -312,14 +314,14 @@ class RbExplore:
         B = []  # a novel state: its trajectory, and its index there
         for tau in trajectories:
             tau.novelty = self.novelty.reward(tau.frames)
-            B += [(tau, i) for i in np.flatnonzero(tau.novelty > self.config.beta)]
-        sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]
+            B += [(tau, i) for i in np.flatnonzero(tau.novelty > self.config.beta)]  # S4.2-16
+        sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]  # S4.2-17
         novel_states = [State(tau.frames[i], tau.snapshots[i]) for tau, i in sample]
         additional = self.collect(novel_states, self.config.additional_steps, False, rng)
         for walked, (tau, i) in zip(additional, sample, strict=False):
             walked.start = tau.start
             # The full prefix goes on from tau's, which ends with its s_1, to the novel state (R29).
-            walked.prefix = tau.prefix[:-1] + list(tau.frames[: i + 1])
+            walked.full_prefix = tau.full_prefix[:-1] + list(tau.frames[: i + 1])
         return additional
 
     def train_similarity(self, pairs, rng):
@@ -388,9 +390,9 @@ class Trajectory:
     actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
     units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
     ended: bool  # by the environment, and not by the number of steps
-    start: int = 0  # the cluster that it began from, or, of an additional one, its exploration did
+    start: int = 0  # the cluster it began from; of an additional one: that its exploration did
     # Frames of the full prefix s_init ... s_1; empty of an exploration from the initial cluster.
-    prefix: list[np.ndarray] = field(default_factory=list)
+    full_prefix: list[np.ndarray] = field(default_factory=list)
     novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
     clusters: list[int] = field(default_factory=list)  # T; of each state in step 4, before merges
 
@@ -478,26 +480,26 @@ def pairs_within(frames, n, N, rng):
     position = np.arange(len(frames))
     for i in range(len(frames)):
         distance = np.abs(position - i)
-        similar = np.flatnonzero(distance < n)  # i itself included, as 0 < n (R30)
+        similar = np.flatnonzero(distance < n)  # S4.1-03; i itself included, as 0 < n (R30)
         pairs.append((frames[i], frames[rng.choice(similar)], 1))
-        dissimilar = np.flatnonzero(distance > N)
+        dissimilar = np.flatnonzero(distance > N)  # S4.1-04; between the two none (S4.1-05)
         if len(dissimilar) > 0:
             pairs.append((frames[i], frames[rng.choice(dissimilar)], 0))
     return pairs
 
 
-def pairs_with_prefix(frames, prefix, N, rng):
+def pairs_with_prefix(frames, full_prefix, N, rng):
     """Figure 2 (c): for each state of a trajectory (T, H, W) a state of its full prefix, if there
     is any, uniform among those more than N steps away along the joined path (S4.2-22, S4.2-23,
     R16)."""
     pairs = []
-    position = np.arange(len(prefix))
+    position = np.arange(len(full_prefix))
     for i in range(len(frames)):
-        # The prefix ends with s_1, with which the trajectory begins. Of an empty one none is drawn.
-        distance = (len(prefix) - 1 + i) - position
+        # The prefix ends with s_1, with which the trajectory begins. An empty one gives no pairs.
+        distance = (len(full_prefix) - 1 + i) - position
         distant = np.flatnonzero(distance > N)
         if len(distant) > 0:
-            pairs.append((frames[i], prefix[rng.choice(distant)], 0))
+            pairs.append((frames[i], full_prefix[rng.choice(distant)], 0))
     return pairs
 
 
@@ -674,14 +676,14 @@ class Graph:
         embeddings = similarity.embed(tau.frames)  # (T, d)
         tau.clusters = [tau.start]  # s_1 is its centre (R9)
         self.clusters[tau.start].visits += 1
-        parent_at = 0  # the state of tau with which the latest cluster was made: a parent (R13)
+        parent_at = 0  # index in tau of the parent's centre: the cluster last made, else s_1 (R13)
         for i in range(1, len(tau.frames)):
             previous = tau.clusters[i - 1]
             v = self.find(embeddings[i], previous, similarity, theta_sim)
             if v is None:
                 v = self.create(tau, i, parent_at, embeddings[i])
                 parent_at = i
-            self.clusters[v].visits += 1
+            self.clusters[v].visits += 1  # S4.2-09; a new one had none
             if v != previous:
                 self.add_arc(previous, v, visits=1)
             tau.clusters.append(v)
@@ -848,9 +850,9 @@ class RND(nn.Module):
         return (self.errors(frames) - recent.mean()) / (recent.std() + 1e-8)
 
     def fit(self, trajectories, rng):
-        """One pass over the frames of trajectories, (T, H, W) each; before it their statistics are
-        updated. The errors after it scale the next iterations' rewards (R4). Returns the mean
-        loss."""
+        """One pass over the frames of trajectories, (T, H, W) each; before it the pixels' mean and
+        variance are updated. The errors after it scale the next iterations' rewards (R4). Returns
+        the mean loss."""
         for frames in trajectories:
             self.pixels.update(frames)
         states = [frame for frames in trajectories for frame in frames]
@@ -858,7 +860,8 @@ class RND(nn.Module):
         order = rng.permutation(len(states))
         for batch in progress(batches(order, self.batch_size), "train RND"):
             losses.append(self.update(np.stack([states[k] for k in batch])))
-        # Taken after the learning: before it, the large errors of one new room would hide the next.
+        # Taken after the learning: before it, the large errors of one new room would widen the
+        # scale and hide the next new room.
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
 
@@ -1139,7 +1142,8 @@ class Random(Baseline):
 
 
 class RNDBonus(RND):
-    """The bonus of Burda et al. 2019: the error of RND on the state arrived at."""
+    """The bonus of Burda et al. 2019: the error of RND on the state arrived at. R4's scale is not
+    used."""
 
     def bonus(self, before, actions, after):
         """Frames (T, H, W), actions (T,), frames (T, H, W) -> (T,). The statistics of the pixels
@@ -1552,7 +1556,8 @@ class Run:
         for name, finds in (("r_tpr", "new"), ("r_tnr", "known")):
             rate = row.get(name)
             if row["phase"] == "explore" and rate is not None and rate < 0.2:
-                cells.append(f"\n       warning: {name} is {rate:.2f}: R finds every state {finds}")
+                found = f"before its training R found nearly all {finds}"
+                cells.append(f"\n       warning: {name} is {rate:.2f}: {found}")
         return " ".join(cells)
 
     def summary(self):

@@ -87,7 +87,7 @@ def tau(numbers, start=0, prefix=()):
     actions = [b""] + [bytes([k % 256]) for k in numbers[1:]]
     t = Trajectory(frames, snapshots, actions, [(k,) for k in numbers[1:]], ended=False)
     t.start = start
-    t.prefix = [frame(k) for k in prefix]
+    t.full_prefix = [frame(k) for k in prefix]
     return t
 
 
@@ -280,8 +280,8 @@ def test_S4_01_step_1_is_M_trajectories_from_the_sampled_centres():
         assert np.array_equal(t.frames[0], clusters[t.start].frame)
         assert t.snapshots[0] == clusters[t.start].snapshot
         walked = a.graph.full_prefix(t.start)
-        assert len(t.prefix) == len(walked) and all(map(np.array_equal, t.prefix, walked))
-    assert any(t.prefix for t in trajectories)
+        assert len(t.full_prefix) == len(walked) and all(map(np.array_equal, t.full_prefix, walked))
+    assert any(t.full_prefix for t in trajectories)
 
 
 def test_an_interrupted_training_leaves_R_in_evaluation_mode():
@@ -539,7 +539,7 @@ def test_S4_1_09_R29_the_prefix_of_an_additional_trajectory_goes_on_to_its_novel
     a.collect = lambda states, steps, covers, rng: [tau([number(s.frame)], 9) for s in states]
     (walked,) = a.walk_on_from_novel_states([t], np.random.default_rng(0))
     before = [0, 1, 2] if start else []
-    assert numbers_of(walked.prefix) == [*before, *range(1000, 1008)]
+    assert numbers_of(walked.full_prefix) == [*before, *range(1000, 1008)]
     assert walked.start == start
 
 
@@ -831,7 +831,7 @@ def test_S4_2_16_snapshots_of_B_restore_the_novel_states():
     i = a.iterate()
     assert len(i.additional) > 10
     for t in i.additional:
-        assert np.array_equal(t.frames[0], t.prefix[-1])
+        assert np.array_equal(t.frames[0], t.full_prefix[-1])
 
 
 def test_S4_2_17_a_random_sample_of_B_of_at_most_L():
@@ -1275,7 +1275,7 @@ def test_S6_1_14_S6_1_15_at_the_restart_G_is_reset_and_R_and_RND_are_kept():
     a.restart()
     assert equal(weights(a.similarity) + weights(a.novelty), before) and a.novelty.recent_errors
     assert list(a.graph.clusters) == [0] and a.graph.arcs == {} and a.discovered == {(6, 1, 2): 400}
-    assert a.theta_sim() == 0.95 and a.iterate().metrics["phase"] == "explore"
+    assert a.theta_sim_now() == 0.95 and a.iterate().metrics["phase"] == "explore"
 
 
 @pytest.mark.parametrize("pool", [None, ThreadPoolExecutor])
@@ -3440,7 +3440,7 @@ def test_a_warning_tells_where_R_finds_everything_new_or_known(tmp_path):
     row = {"iteration": 9, "phase": "explore", "steps": 500, "seconds": 1.0, "units": 3}
     for rate, said in (("r_tpr", "new"), ("r_tnr", "known")):
         run.rows = [row | {rate: 0.0}]
-        assert f"R finds every state {said}" in run.line()
+        assert f"before its training R found nearly all {said}" in run.line()
         run.rows = [row | {rate: 0.1, "phase": "pretrain"}]
         assert "warning" not in run.line()
 
