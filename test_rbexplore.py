@@ -266,11 +266,14 @@ def test_S3_2_03_actions_across_blank_frames_are_kept():
     assert good and f"{len(a.graph.clusters)} of {len(a.graph.clusters)} clusters" in table
 
 
-def test_S4_01_step_1_is_M_trajectories_from_the_sampled_centres():
-    a = restarted(Maze)
+@pytest.mark.parametrize("pretraining", [True, False])
+def test_S4_01_step_1_is_M_trajectories_from_the_sampled_centres(pretraining):
+    a = explorer(Maze, pretrain_steps=1100)
+    a.restart()
     while len(a.graph.clusters) < 4:
         a.iterate()
     clusters = dict(a.graph.clusters)
+    a.pretraining = pretraining
     rng = np.random.default_rng(5)
     trajectories = a.explore(np.random.default_rng(5))
     ids, p = a.graph.sampling_distribution()
@@ -520,8 +523,12 @@ def test_S4_1_08_R_trains_in_training_mode_with_a_clipped_gradient():
 
 
 @pytest.mark.parametrize("start", [0, 1])
-def test_S4_1_09_prefix_pairs_of_exploration_unless_it_began_at_the_initial_cluster(start):
-    a = restarted(Maze)
+@pytest.mark.parametrize("pretraining", [True, False])
+def test_S4_1_09_prefix_pairs_of_exploration_unless_it_began_at_the_initial_cluster(
+    start, pretraining
+):
+    a = explorer(Maze)
+    a.pretraining = pretraining
     a.graph, _ = grown([(0, list(range(40)))], lambda s, s_i: s_i < 39)  # cluster 1 is state 39
     t = tau(range(1000, 1012), start, prefix=numbers_of(a.graph.full_prefix(start)))
     a.novelty.reward = lambda frames: np.zeros(len(frames))
@@ -635,10 +642,14 @@ def test_S4_2_02_pi_explore_is_uniform_over_the_actions_in_every_state():
     env = Maze()
     env.reset()
     actions = Counter()
+    repeated = 0
     for seed in range(150):
         walked = rbexplore.walk(env, State(env.reset()[0], env.snapshot()), seed, 40)
-        actions.update(b"".join(walked.actions))
+        acted = b"".join(walked.actions)
+        actions.update(acted)
+        repeated += sum(acted[t] == acted[t - 1] for t in range(1, len(acted)))
     total = sum(actions.values())
+    assert abs(repeated / total - 1 / 7) < 0.03  # R22: no sticky actions
     chi_square = sum((actions[a] - total / 7) ** 2 / (total / 7) for a in range(7))
     assert total > 3000 and chi_square < 22.5  # 6 degrees of freedom: p = 0.001
     same = [
@@ -770,12 +781,11 @@ def test_R4_the_reward_is_in_deviations_of_the_errors_of_the_latest_five_iterati
     assert np.allclose(rnd.errors(x), error.detach(), rtol=1e-3)
 
 
-def test_R4_observations_are_clipped_at_5():
+def test_R4_observations_are_clipped_at_5_either_way():
     rnd = RND(MAZE, (32, 32))
-    rnd.pixels.update(np.stack([np.full((32, 32), k, np.uint8) for k in (10, 12)]))
-    far, further = np.full((2, 32, 32), 100, np.uint8), np.full((2, 32, 32), 255, np.uint8)
-    assert np.array_equal(rnd.errors(far), rnd.errors(further))
-    assert not np.array_equal(rnd.errors(far), rnd.errors(np.full((2, 32, 32), 13, np.uint8)))
+    rnd.pixels.update(np.stack([np.full((32, 32), k, np.uint8) for k in (120, 122)]))
+    at = {k: rnd.errors(np.full((1, 32, 32), k, np.uint8)) for k in (0, 60, 118, 123, 200, 255)}
+    assert at[0] == at[60] != at[118] and at[255] == at[200] != at[123]
 
 
 def test_R6_before_the_first_training_nothing_is_novel():
@@ -804,6 +814,20 @@ def test_R18_RND_learns_each_state_once_in_mixed_batches():
     assert sorted(learned) == list(range(30)) and learned != list(range(30))
     assert counts == pytest.approx([30] * 4, abs=0.01)  # the statistics come first
     assert np.array_equal(rnd.recent_errors[-1], np.concatenate([rnd.errors(x) for x in frames]))
+
+
+def test_R18_a_step_of_RND_is_down_its_mean_error_unclipped_by_one_adam():
+    rnd = RND(MAZE, (32, 32))
+    with torch.no_grad():
+        rnd.predictor[-1].weight *= 100
+    x = pictures(8)
+    error = rnd.errors(x).mean()
+    assert rnd.update(x) == pytest.approx(error, rel=1e-5)
+    gradients = [weight.grad for weight in rnd.predictor.parameters()]
+    assert math.sqrt(sum(gradient.square().sum().item() for gradient in gradients)) > 10
+    for seed in range(3):
+        rnd.fit([x], np.random.default_rng(seed))
+    assert rnd.optimiser.state_dict()["state"][0]["step"] == 4
 
 
 def novel_where(a, wanted):
@@ -872,6 +896,12 @@ def test_R3_R5_additional_trajectories_are_short_and_of_this_iterations_states()
         assert all(len(t.units) <= 20 for t in i.additional)
         assert all(t.snapshots[0] in states for t in i.additional)
     assert max(len(t.units) for t in i.additional) == 20
+    walks = [b"".join(t.actions)[:10] for t in i.trajectories + i.additional]
+    long = [walked for walked in walks if len(walked) == 10]
+    assert len(set(long)) == len(long) > 30  # each walk has a seed of its own
+    a = restarted(Maze, beta=0.0, L=5, additional_steps=13)
+    a.iterate()
+    assert max(len(t.units) for t in a.iterate().additional) == 13
 
 
 def test_S4_2_19_every_cluster_leads_to_the_first_by_its_parents(maze_run):
@@ -925,9 +955,12 @@ def test_S4_2_24_merge_tests_all_pairs():
     }
 
 
-def test_S4_2_25_merge_above_theta_merge_which_is_its_own():
+@pytest.mark.parametrize("pretraining", [True, False])
+def test_S4_2_25_R28_merge_above_theta_merge_which_is_its_own_in_pretraining_too(pretraining):
     for theta_merge, merged in ((0.6, {1: 0}), (0.7, {}), (0.75, {})):
-        a = restarted(Maze, theta_merge=theta_merge, theta_sim=0.1)
+        a = explorer(Maze, theta_merge=theta_merge, theta_sim=0.1)
+        a.pretraining = pretraining
+        a.steps = 200
         a.graph = Graph(State(frame(0), b"0"))
         a.similarity = Stub(table({(0, 1): 0.7}))
         a.iteration = a.config.merge_every
@@ -1111,7 +1144,10 @@ def test_S6_1_03_one_resnet18_embeds_a_frame_in_512():
     pool = model.encoder.layers[3]
     assert isinstance(pool, nn.MaxPool2d)
     assert (pool.kernel_size, pool.stride, pool.padding) == (3, 2, 1)
-    x = torch.zeros(1, 1, 96, 96)
+    x = rbexplore.to_input(pictures(2, size=96), "cpu")
+    with torch.no_grad():
+        mean = model.encoder.layers(x).mean((2, 3))
+        assert torch.allclose(model.encoder(x), model.encoder.linear(mean), atol=1e-5)
     sizes = []
     for layer in model.encoder.layers:
         x = layer(x)
@@ -1139,6 +1175,13 @@ def test_S6_1_04_R20_concatenated_into_four_fully_connected_layers():
     assert kinds == ["BatchNorm1d", "ReLU", "Linear"] * 4
     linear = [(m.in_features, m.out_features) for m in head if isinstance(m, nn.Linear)]
     assert linear == [(1024, 512), (512, 512), (512, 512), (512, 1)]
+    small = SimilarityModel(replace(MAZE, head_width=48), (32, 32))
+    linear = [(m.in_features, m.out_features) for m in small.head if isinstance(m, nn.Linear)]
+    assert linear == [(128, 48), (48, 48), (48, 48), (48, 1)]
+    e_1, e_2 = torch.randn(2, 5, 64, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        expected = small.head(torch.cat([e_1, e_2], dim=1))[:, 0]
+        assert torch.equal(small.logits(e_1, e_2), expected)
 
 
 def test_S6_1_05_S6_1_08_S6_1_09_S6_1_12_the_papers_values_are_the_defaults():
@@ -1264,16 +1307,19 @@ def test_S6_1_13_states_join_by_the_threshold_that_rises(monkeypatch):
     assert list(dict.fromkeys(used)) == told and told[0] == 0 < told[1] < told[2] < told[3]
 
 
-def test_S6_1_14_S6_1_15_at_the_restart_G_is_reset_and_R_and_RND_are_kept():
+def test_S6_1_14_S6_1_15_R6_R_and_RND_train_in_pretraining_and_are_kept_when_G_is_reset():
     a = explorer(Maze, merge=False, theta_sim=0.95)
+    first = [[w.detach().clone() for w in x.parameters()] for x in (a.similarity, a.novelty)]
     while a.steps < 400:
         a.iterate()
+    for part, weights_before in zip((a.similarity, a.novelty), first, strict=True):
+        assert not equal(list(part.parameters()), weights_before)
     assert len(a.graph.clusters) > 1 and a.discovered == {} and a.pretraining
     assert a.novelty.pixels.count > 300 and a.novelty.pixels.mean.std() > 0
     assert a.novelty.recent_errors
-    before = weights(a.similarity) + weights(a.novelty)
+    before = plain([a.similarity.state_dict(), a.novelty.state_dict()])  # with their optimisers
     a.restart()
-    assert equal(weights(a.similarity) + weights(a.novelty), before) and a.novelty.recent_errors
+    assert plain([a.similarity.state_dict(), a.novelty.state_dict()]) == before
     assert list(a.graph.clusters) == [0] and a.graph.arcs == {} and a.discovered == {(6, 1, 2): 400}
     assert a.theta_sim_now() == 0.95 and a.iterate().metrics["phase"] == "explore"
 
@@ -1350,7 +1396,9 @@ def test_R18_adams_rate_is_that_of_the_configuration():
     config = replace(AGENT, learning_rate=3e-4)
     ppo = PPO(Corridor, config, "icm", "cpu")
     for part in (SimilarityModel(config, (32, 32)), RND(config, (32, 32)), ppo, ppo.curiosity):
-        assert [group["lr"] for group in part.optimiser.param_groups] == [3e-4]
+        (group,) = part.optimiser.param_groups
+        assert type(part.optimiser) is torch.optim.Adam
+        assert (group["lr"], group["weight_decay"]) == (3e-4, 0)
 
 
 def test_networks_begin_with_hes_weights_of_their_own():
@@ -1381,6 +1429,20 @@ def test_an_executor_changes_nothing_and_may_be_shared():
     assert equal(weights(a.similarity), weights(alone.similarity))
     assert a.graph.arcs == alone.graph.arcs and a.discovered == alone.discovered
     assert b.steps == 900
+
+
+def test_a_worker_closes_the_environment_of_its_former_owner():
+    closed = []
+
+    class Closing(Grid):
+        def close(self):
+            closed.append(self)
+
+    with ThreadPoolExecutor(1) as executor:
+        RbExplore(Closing, TINY, executor=executor).iterate()
+        assert closed == []
+        RbExplore(Grid, TINY, executor=executor).iterate()
+    assert len(closed) == 1
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
@@ -1453,6 +1515,7 @@ def test_a_state_dict_does_not_change_with_its_algorithm():
     ({"learning_rate": float("nan")}, "learning_rate is nan"),
 ])  # fmt: skip
 def test_a_configuration_that_cannot_work_is_refused(changes, said):
+    replace(MAZE, n=10)  # n may be N
     with pytest.raises(InputError, match=said):
         replace(MAZE, **changes)
 
