@@ -963,8 +963,11 @@ def test_S4_2_25_R28_merge_above_theta_merge_which_is_its_own_in_pretraining_too
         a.steps = 200
         a.graph = Graph(State(frame(0), b"0"))
         a.similarity = Stub(table({(0, 1): 0.7}))
+        a.iteration = a.config.merge_every - 1
+        assert a.update_graph([tau([0, 1])], theta_sim=0.8) == {}
+        assert len(a.graph.clusters) == 2
         a.iteration = a.config.merge_every
-        assert a.update_graph([tau([0, 1])], theta_sim=0.8) == merged
+        assert a.update_graph([], theta_sim=0.1) == merged
         assert len(a.graph.clusters) == 2 - len(merged)
 
 
