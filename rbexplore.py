@@ -282,7 +282,7 @@ class RbExplore:
             limit = min(max_steps, left)
             # Workers walk side by side, so only those are begun that fit at full length; what the
             # shorter ones leave is for the next round.
-            fitting = left // limit
+            fitting = max(1, left // max_steps)
             first = len(trajectories)
             jobs = [(starts[k], seeds[k], limit) for k in range(first, len(starts))][:fitting]
             for tau in progress(walk_all(self, jobs), "walk", len(jobs)):
