@@ -1232,14 +1232,18 @@ def test_S6_1_06_trajectories_are_at_most_so_many_steps_long(maze_run):
     assert max(lengths) == TINY.trajectory_steps and min(lengths) < TINY.trajectory_steps
 
 
-def test_S6_1_07_a_death_ends_the_trajectory_and_is_no_state():
+def walks_on_the_grid(place, count, steps):
+    """Walks of so many steps from a place of the grid."""
     env = Grid()
     env.reset()
-    env.place = (6, 4)
+    env.place = place
     start = State(env.picture(), env.snapshot())
+    return [rbexplore.walk(env, start, seed, steps) for seed in range(count)]
+
+
+def test_S6_1_07_a_death_ends_the_trajectory_and_is_no_state():
     ends = Counter()
-    for seed in range(200):
-        walked = rbexplore.walk(env, start, seed, 12)
+    for walked in walks_on_the_grid((6, 4), count=200, steps=12):
         dead = walked.units[-1] is None
         assert None not in walked.units[:-1]
         assert len(walked.frames) == len(walked.snapshots) == len(walked.actions)
@@ -1251,21 +1255,13 @@ def test_S6_1_07_a_death_ends_the_trajectory_and_is_no_state():
 
 
 def test_R10_the_state_at_which_an_episode_is_cut_off_is_a_state():
-    env = Grid()
-    env.reset()
-    env.place = (0, 4)
-    start = State(env.picture(), env.snapshot())
-    walked = [rbexplore.walk(env, start, seed, 12) for seed in range(60)]
+    walked = walks_on_the_grid((0, 4), count=60, steps=12)
     cut = [w for w in walked if w.units[-1] == (0, 6)]
     assert cut and all(w.snapshots[-1] == bytes((0, 6)) and w.ended for w in cut)
 
 
 def test_R24_blank_frames_are_counted_and_replayed_but_are_no_states():
-    env = Grid()
-    env.reset()
-    env.place = (4, 3)
-    start = State(env.picture(), env.snapshot())
-    walked = [rbexplore.walk(env, start, seed, 20) for seed in range(40)]
+    walked = walks_on_the_grid((4, 3), count=40, steps=20)
     assert all(picture.any() for w in walked for picture in w.frames)
     assert any(len(actions) > 1 for w in walked for actions in w.actions)
     assert any(len(w.units) > len(w.frames) for w in walked)
