@@ -349,7 +349,7 @@ def test_S4_03_S4_04_S4_05_the_steps_in_the_papers_order(monkeypatch):
 
 
 def test_S4_03_states_are_assigned_by_the_R_just_trained():
-    a = restarted(Maze)
+    a = restarted(Maze, merge=False)
     a.iterate()
     i = a.iterate()
     for t in i.trajectories:
