@@ -1,13 +1,18 @@
 """Environments that can be rolled back (paper 3.2 and 5).
 
-The contract of a persistent environment · the maze · the emulators · coverage units ·
+The contract of a persistent environment · the maze · the emulators · coverage units · workers ·
 the factory by name. Coverage units are for metrics and figures; the algorithm never sees them.
 """
 
+import functools
 import gzip
 import inspect
 import tempfile
+import threading
+import uuid
 import zlib
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,36 +21,34 @@ import numpy as np
 
 
 class InputError(ValueError):
-    """Something that the user can put right; its message is the one line that is shown."""
+    """Something that the user can put right. Its message is the one line that is shown."""
 
     def __init__(self, message: str):
-        super().__init__(" ".join(message.split()))  # what it quotes may have several lines
+        super().__init__(" ".join(message.split()))  # a quoted text may have several lines
 
 
 # ---- The contract of a persistent environment (paper 3.2; S3.2-01, S3.2-02) ----------------------
 
 
 class PersistentEnv(gymnasium.Env):
-    """A Gymnasium environment whose states can be saved and returned to: a persistent MDP (3.2).
+    """A Gymnasium environment whose states can be saved and restored: a persistent MDP (3.2).
 
-    observation_space: a Box of uint8, (H, W) or (H, W, C) with C <= 4: channels come last.
+    observation_space: a Box of uint8, (H, W) or (H, W, C) with C <= 4, channels last.
     action_space: Discrete, at most 256 actions. Rewards are ignored.
-    reset(seed=...) gives (frame, info), and the same seed the same state every time.
+    reset(seed=...) returns (frame, info); the same seed leads to the same state every time.
 
-    info["blank"] = True in a step's info says that the frame is a transition screen and no state
-    (R24): the step counts, but the frame is never a centre.
+    info["blank"] = True marks the frame of a step as a transition screen (R24): the step counts,
+    but the frame is not a state.
 
-    A level_map(), if there is one, is for figures: the picture of the level (H, W, 3) uint8, and
-    the box (left, top, width, height) of each unit in it, in pixels.
+    level_map(), which is optional, is for figures: it returns a picture of the level, (H, W, 3)
+    uint8, and the box (left, top, width, height) of each unit of full coverage, in pixels.
 
-    A time limit belongs outside the environment, or at least outside the snapshot's way: a limit
-    whose counter is in the snapshot is restored with it, and strangles exploration, which goes on
-    from ever later states. The configuration sets the length of a trajectory. A counter outside
-    the snapshot breaks the replay, so there should be none at all.
+    Do not put a time limit in the environment. If its counter is in the snapshot, restoring a
+    snapshot restores the counter, and the walks from late states are cut off. If it is not, the
+    replay is not exact. Config.trajectory_steps limits the length of a trajectory.
 
-    Snapshots are held by the thousand: an iteration holds one for each of its states, which at
-    1 MB each and with the paper's numbers makes 95 GB (M x trajectory_steps and L x
-    additional_steps). Keep them small.
+    Keep snapshots small. An iteration holds one for each of its states, which at 1 MB each and in
+    the paper's configuration makes 95 GB (M x trajectory_steps + L x additional_steps).
     """
 
     full_coverage: int | None = None  # number of units of full coverage (5), None if unknown
@@ -56,57 +59,163 @@ class PersistentEnv(gymnasium.Env):
         raise NotImplementedError
 
     def restore(self, snapshot: bytes) -> np.ndarray:
-        """Return to the state of `snapshot`, at no step; gives its observation, and that alone.
+        """Return to the state of `snapshot` without an environment step. Returns its observation.
 
-        The same actions then give the same frames and outcomes as the first time, in any process.
-        InputError: malformed, or of another environment.
+        Emulators do not restore the screen, and some renderers draw random numbers. In such a case,
+        store the frame in the snapshot.
+
+        The same actions then lead to the same frames and outcomes as before, in any process.
+        Raises InputError if the snapshot is malformed or of another environment.
         """
         raise NotImplementedError
 
     def unit(self) -> tuple | int | str | None:
-        """The coverage unit in which the agent stands (5), see unit_key; None: in none, or dead."""
+        """The coverage unit in which the agent is (5; see unit_key), or None."""
         raise NotImplementedError
 
 
 METHODS = ("reset", "step", "snapshot", "restore", "unit", "close")
-CONTRACT_STEPS = 100  # of the walk that check_contract plays
 
 
-def check_contract(env, seed: int = 0) -> None:
-    """Raise InputError, one line, unless `env` is a persistent environment (PersistentEnv).
+def make_checked(env_fn: Callable[[], PersistentEnv], seed: int) -> PersistentEnv:
+    """Make an environment and check its contract. Raises InputError, one line."""
+    if not callable(env_fn):
+        raise InputError(
+            f"{env_fn!r:.80} is not a function: give a class or function that makes the "
+            "environment, not the environment itself"
+        )
+    env = env_fn()
+    check_contract(env, seed)
+    return env
 
-    It plays: a random walk with snapshots on the way, then each part of the walk once more from
-    its snapshot, the last part first. What is seen must be the same. Afterwards `env` is at s_init.
-    What does not show within such a walk, or only in another process, it cannot find.
+
+def check_contract(env: PersistentEnv, seed: int = 0, steps: int = 100) -> None:
+    """Raise InputError, one line, unless `env` behaves as a persistent environment.
+
+    A random walk of `steps` steps is recorded, with snapshots on the way. Then the snapshots are
+    restored in the reverse order, and the actions after each are repeated: everything must look as
+    it did before. Afterwards `env` is at s_init. Faults that show later, or only in another
+    process, are not found.
     """
     check_methods(env)
     check_spaces(env)
-    player = ContractPlayer(env, seed)
-    parts = player.walk()
-    # In another order than the first time: what the snapshots lack is then out of place.
-    for part in reversed(parts):
-        player.replay(part)
-    player.compare("reset() with the same seed", parts[0].start, player.reset())
+    rng = np.random.default_rng(0)
+    where = Moment(env)
+    start = where.reset(seed)
+    seen = start
+    parts = []  # of the walk: (steps before it, snapshot, what is seen, [(action, what is seen)])
+    while where.steps < steps:
+        part = (where.steps, where.snapshot(), seen, [])
+        parts.append(part)
+        # Uneven lengths, so that a hidden clock is not right again by chance.
+        for _ in range(rng.integers(5, 15)):
+            action = int(env.action_space.start + rng.integers(env.action_space.n))
+            seen = where.step(action)
+            part[3].append((action, seen))
+            if seen["terminated"] or seen["truncated"]:
+                seen = where.reset(seed)
+                break
+    for steps_before, snapshot, first, moves in reversed(parts):
+        where.steps = steps_before
+        where.compare("restore()", first, where.look("restore", where.call("restore", snapshot)))
+        for action, before in moves:
+            where.compare("the same action after a restore", before, where.step(action))
+    where.compare("reset() with the same seed", start, where.reset(seed))
 
 
-def check_methods(env) -> None:
+class Moment:
+    """An environment at some step of the walk of check_contract. Every fault is an InputError that
+    names the step."""
+
+    def __init__(self, env):
+        self.env = env
+        self.steps = 0
+
+    def call(self, name, *arguments, **named):
+        try:
+            return getattr(self.env, name)(*arguments, **named)
+        except Exception as error:
+            self.refuse(f"{name}() fails with {type(error).__name__}: {error}")
+
+    def refuse(self, problem):
+        raise InputError(f"the environment, after step {self.steps}: {problem}") from None
+
+    def reset(self, seed):
+        result = self.call("reset", seed=seed)
+        pair = isinstance(result, tuple) and len(result) == 2
+        if not pair or not isinstance(result[1], dict):
+            self.refuse("reset() must return a frame and a dict")
+        return self.look("reset", result[0])
+
+    def step(self, action):
+        self.steps += 1
+        result = self.call("step", action)
+        if not isinstance(result, tuple) or len(result) != 5 or not isinstance(result[4], dict):
+            self.refuse("step() must return frame, reward, terminated, truncated, and a dict")
+        frame, _, terminated, truncated, info = result
+        seen = self.look("step", frame)
+        flags = {
+            "terminated": terminated,
+            "truncated": truncated,
+            "blank": info.get("blank", False),
+        }
+        for name, flag in flags.items():
+            if not isinstance(flag, bool | np.bool_):
+                self.refuse(f"step() returns {flag!r:.60} for {name}: it must be a bool")
+            seen[name] = bool(flag)
+        return seen
+
+    def snapshot(self):
+        snapshot = self.call("snapshot")
+        if not isinstance(snapshot, bytes) or not snapshot:
+            self.refuse(f"snapshot() returns {snapshot!r:.60}: it must be bytes, at least one")
+        return snapshot
+
+    def look(self, name, frame):
+        """A copy of the frame that a method returned, and the unit."""
+        shape = self.env.observation_space.shape
+        if not isinstance(frame, np.ndarray):
+            self.refuse(f"{name}() returns a {type(frame).__name__} as the frame, not an array")
+        if frame.shape != shape or frame.dtype != np.uint8:
+            self.refuse(
+                f"{name}() returns a frame {frame.shape} of {frame.dtype}: the observation space "
+                f"says {shape} of uint8"
+            )
+        unit = self.call("unit")
+        try:
+            return {"frame": frame.copy(), "unit": unit_key(unit)}
+        except InputError as error:
+            self.refuse(str(error))
+
+    def compare(self, what, first, second):
+        for name in first.keys() & second.keys():  # restore() and reset() show frame and unit only
+            if np.array_equal(first[name], second[name]):
+                continue
+            detail = ""
+            if name == "frame":
+                places = np.argwhere(first[name] != second[name])
+                detail = f": {len(places)} values differ, the first at {tuple(places[0].tolist())}"
+            self.refuse(f"{what} leads to a different {name} than the first time{detail}")
+
+
+def check_methods(env):
     """Raise InputError unless `env` is an instance with the methods of the contract."""
     maker = callable(env) and not hasattr(env, "step")
     if maker or isinstance(env, type):
         raise InputError(
-            f"{env!r:.80} is no environment: give a function that makes the environment, so "
-            "that calling it once gives an instance"
+            f"{env!r:.80} is not an environment: give a function that makes the environment, "
+            "so that calling it once returns an instance"
         )
     missing = [name for name in METHODS if not callable(getattr(env, name, None))]
     if missing:
         wrapped = isinstance(env, gymnasium.Wrapper)
-        hint = "; give env.unwrapped, or add them to the wrapper" if wrapped else ""
+        hint = "; use env.unwrapped, or add them to the wrapper" if wrapped else ""
         raise InputError(
             f"the environment lacks {', '.join(missing)}(), see PersistentEnv in envs.py{hint}"
         )
 
 
-def check_spaces(env) -> None:
+def check_spaces(env):
     """Raise InputError unless the spaces are as PersistentEnv says."""
     actions = getattr(env, "action_space", None)
     if not isinstance(actions, gymnasium.spaces.Discrete) or actions.n > 256:
@@ -121,115 +230,6 @@ def check_spaces(env) -> None:
         )
     if len(frames.shape) == 3 and frames.shape[2] > 4:
         raise InputError(f"frames are {frames.shape}: channels come last, (H, W, C), at most 4")
-
-
-class Part(NamedTuple):
-    """A part of the contract's walk: to the next snapshot, or to the end of an episode."""
-
-    steps: int  # taken before it
-    snapshot: bytes
-    start: dict  # what is seen there
-    moves: list[tuple[int, dict]]  # each action, and what is seen after it
-
-
-class ContractPlayer:
-    """Plays an environment for check_contract. What breaks the contract is an InputError."""
-
-    def __init__(self, env, seed: int):
-        self.env = env
-        self.seed = seed
-        self.steps = 0  # of the walk, up to the moment that is played
-
-    def walk(self) -> list[Part]:
-        """Play the random walk, going on from reset where an episode ends."""
-        space = self.env.action_space
-        generator = np.random.default_rng(0)
-        parts = []
-        seen = self.reset()
-        while self.steps < CONTRACT_STEPS:
-            part = Part(self.steps, self.snapshot(), seen, [])
-            parts.append(part)
-            # Uneven lengths: a hidden clock must not be right again by its period.
-            for _ in range(generator.integers(5, 15)):
-                action = int(space.start + generator.integers(space.n))
-                seen = self.step(action)
-                part.moves.append((action, seen))
-                if seen["terminated"] or seen["truncated"]:
-                    seen = self.reset()
-                    break
-        return parts
-
-    def replay(self, part):
-        """Restore the snapshot of a part and play its actions again."""
-        self.steps = part.steps
-        frame = self.call("restore", part.snapshot)
-        self.compare("restore()", part.start, self.see("restore", frame))
-        for action, seen in part.moves:
-            self.compare("the same action after a restore", seen, self.step(action))
-
-    def compare(self, what, first, second):
-        for name in first:
-            # A restore or a reset tells of the frame and the unit alone.
-            if name in second and first[name] != second[name]:
-                self.refuse(f"{what} gives another {name} than the first time")
-
-    def reset(self):
-        result = self.call("reset", seed=self.seed)
-        pair = isinstance(result, tuple) and len(result) == 2
-        if not pair or not isinstance(result[1], dict):
-            self.refuse("reset() must give a frame and a dict")
-        return self.see("reset", result[0])
-
-    def step(self, action):
-        self.steps += 1
-        result = self.call("step", action)
-        if not isinstance(result, tuple) or len(result) != 5:
-            self.refuse("step() must give five values: frame, reward, terminated, truncated, info")
-        frame, _, terminated, truncated, info = result
-        if not isinstance(info, dict):
-            self.refuse(f"step() gives {info!r:.60} for info: give a dict")
-        seen = self.see("step", frame)
-        blank = info.get("blank", False)
-        flags = {"terminated": terminated, "truncated": truncated, "blank": blank}
-        for name, flag in flags.items():
-            if not isinstance(flag, bool | np.bool_):
-                self.refuse(f"step() gives {flag!r:.60} for {name}: give a bool")
-            seen[name] = bool(flag)
-        return seen
-
-    def snapshot(self):
-        snapshot = self.call("snapshot")
-        if not isinstance(snapshot, bytes):
-            self.refuse(f"snapshot() gives {type(snapshot).__name__}: give bytes")
-        return snapshot
-
-    def see(self, name, frame):
-        """The frame that a method gave, as bytes, and the unit."""
-        shape = self.env.observation_space.shape
-        if not isinstance(frame, np.ndarray):
-            self.refuse(f"{name}() gives a {type(frame).__name__} for the frame: give an array")
-        if frame.shape != shape or frame.dtype != np.uint8:
-            self.refuse(
-                f"{name}() gives a frame {frame.shape} of {frame.dtype}: "
-                f"the observation space says {shape} of uint8"
-            )
-        unit = self.call("unit")
-        try:
-            key = unit_key(unit)
-        except InputError as error:
-            self.refuse(str(error))
-        # A copy of the frame: the environment may use its array again.
-        return {"frame": frame.tobytes(), "unit": key}
-
-    def call(self, name, *arguments, **named):
-        """Call a method of the environment; an error in it is told in one line."""
-        try:
-            return getattr(self.env, name)(*arguments, **named)
-        except Exception as error:
-            self.refuse(f"{name}() fails with {type(error).__name__}: {error}")
-
-    def refuse(self, problem):
-        raise InputError(f"the environment, after step {self.steps}: {problem}") from None
 
 
 # ---- The maze: a side-view level in the spirit of the Prince of Persia (paper 5) -----------------
@@ -336,24 +336,27 @@ class Maze(PersistentEnv):
     """A deterministic level of several rooms, of which the agent sees one; the reward is always 0.
 
     LEFT and RIGHT turn the agent or, where it faces that way, run one tile.
-    A jumps two tiles ahead, over whatever is in the tile between.
-    B steps one tile ahead, onto spikes without harm and never over an edge.
-    UP climbs, from under an opening, to the floor beside it that the agent faces.
-    DOWN hangs from the edge ahead and lets go, which takes a row off the fall.
-    A fall of two rows or more kills, and so do spikes met in any way but by B.
+    A jumps two tiles ahead, over whatever is on the tile between.
+    B steps one tile ahead, onto spikes without harm, and never over an edge.
+    UP climbs from under an opening to the floor beside it that the agent faces.
+    DOWN hangs from the edge ahead and lets go, which shortens the fall by one row.
+    A fall of two rows or more kills, and so do spikes unless the agent steps on them with B.
 
     unit() is (room, column, row). A snapshot is canonical: equal states have equal bytes.
-    InputError: an unknown level, a frame_size that is no int or is below 32.
+    frameskip must be 1: a step is a whole move.
+    Raises InputError for an unknown level, and a frame_size that is not an int of 32 or more.
     """
 
     unit_name = "tiles"
 
-    def __init__(self, level: int = 1, frame_size: int = 32):
+    def __init__(self, level: int = 1, frame_size: int = 32, frameskip: int = 1):
         if not isinstance(level, int) or level not in LEVELS:
             known = ", ".join(str(number) for number in sorted(LEVELS))
             raise InputError(f"unknown maze level {level!r}: there are {known}")
         if not isinstance(frame_size, int) or frame_size < 32:
             raise InputError(f"frame_size must be an int, 32 pixels or more, not {frame_size!r}")
+        if frameskip != 1:
+            raise InputError(f"a step of the maze is a whole move: frameskip is 1, not {frameskip}")
         self.level = level
         self.frame_size = frame_size
         drawing = LEVELS[level].replace(" ", "")
@@ -367,17 +370,17 @@ class Maze(PersistentEnv):
         self.state = self.start
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._seen: dict[State, np.ndarray] = {}  # frames of the states met lately
+        self._seen: dict[State, np.ndarray] = {}  # frames of recent states
         self.full_coverage = len(self.reachable())
 
     def reset(self, *, seed=None, options=None):
-        """Back to the start; gives the frame, (frame_size, frame_size) uint8, and {}."""
+        """Return to the start. Returns the frame, (frame_size, frame_size) uint8, and {}."""
         super().reset(seed=seed)
         self.state = self.start
         return self._frame(), {}
 
     def step(self, action: int):
-        """One action. InputError: it is not one of 0 to 6, or the agent is already dead."""
+        """One action. Raises InputError unless it is one of 0 to 6 and the agent is alive."""
         check_action(action, 7)
         if self.state.dead:
             raise InputError("the agent is dead: reset or restore the maze before the next step")
@@ -394,23 +397,23 @@ class Maze(PersistentEnv):
         return self._frame()
 
     def unit(self) -> tuple[int, int, int] | None:
-        """(room, column, row) of the living agent, None of a dead one."""
+        """(room, column, row) of the agent; None if it is dead."""
         if self.state.dead:
             return None
         return self._place(self.state.x, self.state.y)
 
     def reachable(self) -> set[tuple[int, int, int]]:
-        """Every unit in which the agent can stand alive, by search over the full states (S5-03)."""
+        """Every unit that the agent can reach alive, by a search over all states (S5-03)."""
         states = self._search(self.start)
         return {self._place(state.x, state.y) for state in states if not state.dead}
 
     def distances(self, snapshot: bytes) -> dict[bytes, int]:
-        """Steps from the state of `snapshot` to every state that follows from it, by snapshot."""
+        """Snapshot of every state that can be reached from this one -> steps to it."""
         found = self._search(self._read(snapshot))
         return {bytes((self.level, *state)): steps for state, steps in found.items()}
 
     def level_map(self) -> tuple[np.ndarray, dict[tuple, tuple[int, int, int, int]]]:
-        """The level in tiles of 8 x 24 pixels, nothing pressed, and each reachable unit's box."""
+        """The level in tiles of 8 x 24 pixels with no plate pressed, and the box of each unit."""
         w = 8
         h = 24
         lines = []
@@ -430,11 +433,11 @@ class Maze(PersistentEnv):
         return room, x % COLUMNS, y % ROWS
 
     def _pressed(self, letter, plates):
-        """Is the plate of that letter, or of that gate's letter, pressed?"""
+        """Whether the plate of this letter, or the plate of this gate, is pressed."""
         return bool(plates >> self.letters.index(letter.lower()) & 1)
 
     def _tile(self, x, y, plates):
-        """The tile as it acts now: a closed gate is wall, an open one floor."""
+        """The tile as it acts now: a closed gate is a wall, an open one is floor."""
         if not (0 <= y < len(self.tiles) and 0 <= x < len(self.tiles[0])):
             return "#"  # beyond the level
         tile = self.tiles[y][x]
@@ -481,10 +484,10 @@ class Maze(PersistentEnv):
         return State(x, y, facing, plates, int(crushed or impaled))
 
     def _search(self, start: State) -> dict[State, int]:
-        """Breadth-first: each state that follows from `start`, with its distance in steps."""
+        """Breadth-first search: every state that can be reached from `start` -> steps to it."""
         steps = {start: 0}
         queue = [start]
-        for state in queue:  # which grows meanwhile
+        for state in queue:  # grows during the loop
             if state.dead:
                 continue
             for action in range(7):
@@ -495,7 +498,7 @@ class Maze(PersistentEnv):
         return steps
 
     def _read(self, snapshot: bytes) -> State:
-        """The state of a snapshot. InputError: it is of another level, or of no possible state."""
+        """The state of a snapshot. Raises InputError for another level or an impossible state."""
         if isinstance(snapshot, bytes) and len(snapshot) == 6 and snapshot[0] == self.level:
             state = State(*snapshot[1:])
             flags = state.facing < 2 and state.dead < 2
@@ -505,7 +508,7 @@ class Maze(PersistentEnv):
         raise InputError(f"no snapshot of maze level {self.level}: {snapshot!r:.60}")
 
     def _frame(self):
-        """The observation of the present state, a copy: the caller may write into it."""
+        """The observation of the current state: a copy, which the caller may change."""
         if self.state not in self._seen:
             if len(self._seen) >= FRAMES_KEPT:
                 self._seen.clear()
@@ -513,9 +516,7 @@ class Maze(PersistentEnv):
         return self._seen[self.state].copy()
 
     def _draw(self):
-        """The observation: the room's luminance, centred on black.
-
-        In whole numbers, so that every machine agrees."""
+        """The luminance of the room, centred on black; in integers, the same on every machine."""
         size = self.frame_size
         picture = self._picture(size // COLUMNS, size // ROWS)
         height, width, _ = picture.shape
@@ -548,7 +549,7 @@ class Maze(PersistentEnv):
 
 
 def paint_back_wall(room, w, h):
-    """The wall behind a room, (3 h, 10 w, 3) uint8: rooms differ in pattern, shade and tint."""
+    """The back wall of a room, (3 h, 10 w, 3) uint8. Rooms differ in pattern, shade and tint."""
     down, across = np.indices((ROWS * h, COLUMNS * w)) // max(1, w // 3)
     patterns = (
         np.zeros_like(down),
@@ -563,7 +564,7 @@ def paint_back_wall(room, w, h):
 
 
 def paint_tile(box: np.ndarray, tile: str, pressed: bool) -> None:
-    """Paint one tile, (h, w, 3) uint8, in place; `pressed`: it is a plate that is, or its gate."""
+    """Paint one tile, (h, w, 3) uint8, in place. pressed: of a plate, and of the plate's gate."""
     h, w, _ = box.shape
     thick = max(1, h // 8)
     if tile == "#":
@@ -587,7 +588,7 @@ def paint_tile(box: np.ndarray, tile: str, pressed: bool) -> None:
 
 
 def paint_agent(box: np.ndarray, facing: int, dead: int) -> None:
-    """Paint the agent over a tile, (h, w, 3) uint8, in place: above its floor, sampled to size."""
+    """Paint the agent into a tile, (h, w, 3) uint8, in place, above its floor and at its size."""
     drawing = DEAD if dead else ALIVE
     sprite = np.array([list(line) for line in drawing.split()])  # (12, 6)
     if not facing:
@@ -603,67 +604,58 @@ def paint_agent(box: np.ndarray, facing: int, dead: int) -> None:
 
 # ---- The emulators (3.2, 5, 6.1; S3.2-01, S3.2-02, S5-*, S6.1-01, S6.1-07, S6.2-01, S6.2-02) -----
 
-FRAMESKIP = 4  # emulator frames a step (S6.1-01)
-GRAY = np.array([299, 587, 114], np.float32)  # of red, green and blue, in 1/1000
-
-
-def overlaps(pixels: int, size: int) -> np.ndarray:
-    """(size, pixels): how much of each pixel, in 1/size of it, lies in each of `size` parts."""
-    part = np.arange(size)[:, None] * pixels
-    pixel = np.arange(pixels) * size
-    end = np.minimum(part + pixels, pixel + size)
-    begin = np.maximum(part, pixel)
-    return (end - begin).clip(0).astype(float)
-
 
 class EmulatorEnv(PersistentEnv):
     """What the emulators share: frames (S5-01), snapshots (3.2), the end of an episode (R23).
 
-    A frame is the last one of a step (R22), gray, area-averaged to (frame_size, frame_size) uint8.
+    A step is `frameskip` emulator frames of one action (S6.1-01). The observation is the last of
+    them (R22), in gray, resized to (frame_size, frame_size) uint8.
     The reward is 0.0. info holds the readings of RAM, and "blank": no pixel is lit (R24).
-    InputError: an action out of range, and any use after close().
+    Raises InputError for an action out of range, and for any use after close().
 
-    A subclass sets _emulator, has _screen, _save, _load, _tick, _ram and _place, then calls _begin.
+    A subclass sets _emulator, implements _screen, _save, _load, _tick, _ram and _place, and calls
+    _begin.
     """
 
     LIVES = "lives"  # the reading whose drop ends the episode
-    level: int | None = None  # the level whose leaving ends it, where RAM tells the level
+    level: int | None = None  # leaving it ends the episode
     _emulator = None  # None: closed
 
-    def _begin(self, game, actions, frame_size):
-        """Make the present state s_init. `game` keeps the snapshots of different games apart."""
+    def _begin(self, game, actions, frame_size, frameskip):
+        """Make the current state s_init. `game` keeps the snapshots of different games apart."""
+        self.frameskip = frameskip
         self.action_space = gymnasium.spaces.Discrete(actions)
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self._frame = self._observe().tobytes()
-        # Most of a state never changes: packed against s_init, it takes a fraction of its bytes.
+        # Most of a state never changes, so it compresses well with s_init as the dictionary.
         self._dictionary = game + self._frame + self._save()
         self._start = self.snapshot()
 
     def _observe(self):
         """The screen, (H, W, 3) uint8, as an observation."""
-        luma = np.rint(self._screen().astype(np.float32) @ GRAY / 1000)  # (H, W)
-        size = self.observation_space.shape[0]
-        down = overlaps(luma.shape[0], size)
-        across = overlaps(luma.shape[1], size)
-        # Whole numbers as far as the division, so exact on every machine.
-        return (down @ luma @ across.T // luma.size).astype(np.uint8)
+        from PIL import Image
+
+        # Pillow computes in integers, so every machine agrees.
+        size = self.observation_space.shape
+        gray = Image.fromarray(self._screen()).convert("L")
+        return np.array(gray.resize(size, Image.Resampling.BILINEAR))  # which is antialiased
 
     def _check_open(self):
         if self._emulator is None:
             raise InputError("the emulator is closed: make the environment anew")
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Back to s_init, the same state every time. Returns (frame, info)."""
+        """Return to s_init, the same state every time. Returns (frame, info)."""
         super().reset(seed=seed)
         frame = self.restore(self._start)
         return frame, self._info(frame)
 
     def step(self, action: int):
-        """Four emulator frames of one action. Returns (frame, 0.0, terminated, False, info)."""
+        """One action. Returns (frame, 0.0, terminated, False, info)."""
         self._check_open()
         check_action(action, self.action_space.n)
         lives = self._ram()[self.LIVES]
-        for _ in range(FRAMESKIP):
+        for _ in range(self.frameskip):
             self._tick(int(action))
         frame = self._observe()
         self._frame = frame.tobytes()
@@ -675,17 +667,17 @@ class EmulatorEnv(PersistentEnv):
         return {**self._ram(), "blank": not frame.any()}
 
     def snapshot(self) -> bytes:
-        """The emulator's whole state and the frame, as emulators restore no screen; compressed."""
+        """The complete state and the frame, because emulators do not restore the screen."""
         self._check_open()
         packer = zlib.compressobj(level=2, zdict=self._dictionary)
         return packer.compress(self._frame + self._save()) + packer.flush()
 
     def restore(self, snapshot: bytes) -> np.ndarray:
-        """Load a snapshot, at no step; gives its frame. InputError: damaged, of another s_init."""
+        """Load a snapshot (see PersistentEnv.restore). Returns the frame stored in it."""
         self._check_open()
         unpacker = zlib.decompressobj(zdict=self._dictionary)
         try:
-            # zlib compares the checksums of dictionary and content.
+            # zlib verifies the checksums of dictionary and content.
             content = unpacker.decompress(snapshot)
         except (zlib.error, TypeError):
             content = b""
@@ -712,22 +704,22 @@ class PrinceOfPersia(EmulatorEnv):
 
     rom: the user's cartridge image, an iNES file.
     state: the gzip of an emulator state, as the authors publish them (level 1: in the sword's room
-    with the sword, 6.2). As a state has no screen, s_init comes one frame without buttons after it.
-    Without `state`, s_init is one second after power-on: only for a cartridge that is then in play
-    on `level`, as no action is START.
+    with the sword, 6.2). A state has no screen, so s_init comes one frame without buttons after it.
+    Without `state`, s_init is one second after power-on. This suits only a cartridge that is then
+    in play on `level`, because no action is START.
     The clock is held at 99 minutes.
     info: level, room, x, y (pixels), hit_points, sword, blank.
 
-    unit() is (room, x // 32, y // 32), and None of the dead, outside the room (left of it x wraps
-    to 65535) and outside the level. %Cov is an estimate: the sets counted in FULL_COVERAGE hold
-    only the positions that the authors' reference allows, so the units visited may outnumber them
-    (744 of 721 on level 1). Without these sets we cannot drop the others; the caller cuts at 1.
+    unit() is (room, x // 32, y // 32); None if the prince is dead, outside the room (left of it x
+    wraps to 65535) or outside the level. %Cov is an estimate: FULL_COVERAGE counts the positions in
+    the authors' reference data. We have their numbers but not the sets, so the units visited may
+    include others and outnumber them (744 of 721 on level 1); the share is cut at 1.
 
-    InputError: an unusable file, another level's state, no stable-retro, a second emulator in the
-    process.
+    Raises InputError for an unusable file, a state of another level, a missing stable-retro, or a
+    second emulator in the process.
     """
 
-    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # S5-02; NO-OP names no button
+    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # S5-02; no button is named NO-OP
     # Units in the full coverage sets of levels 1 to 14, from the authors' reference data (R26).
     FULL_COVERAGE = (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
     LIVES = "hit_points"
@@ -739,6 +731,7 @@ class PrinceOfPersia(EmulatorEnv):
         level: int = 1,
         state: str | None = None,
         frame_size: int = 96,
+        frameskip: int = 4,
     ):
         if not isinstance(level, int) or level not in range(1, 15):
             raise InputError(f"Prince of Persia has levels 1 to 14, not {level}")
@@ -756,7 +749,7 @@ class PrinceOfPersia(EmulatorEnv):
         self._start_emulator(rom, image)
         self._enter(start, state or rom)
         game = b"%d %d" % (zlib.crc32(image), level)
-        self._begin(game, len(self.ACTIONS), frame_size)
+        self._begin(game, len(self.ACTIONS), frame_size, frameskip)
 
     def _start_emulator(self, rom, image):
         try:
@@ -765,7 +758,7 @@ class PrinceOfPersia(EmulatorEnv):
             raise InputError(
                 "Prince of Persia needs stable-retro: pip install stable-retro"
             ) from None
-        # The core goes by the suffix and reads the file once: a copy will do, nothing stays behind.
+        # The core recognises the suffix .nes and reads the file once, so a temporary copy will do.
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder, "rom.nes")
             copy.write_bytes(image)
@@ -781,12 +774,12 @@ class PrinceOfPersia(EmulatorEnv):
         self._masks = np.array(masks, np.uint8)
 
     def _enter(self, start, name):
-        """Go to s_init, from the start state or from power-on; `name` is the file to blame."""
+        """Go to s_init, from the start state or from power-on. name: the file to name in errors."""
         problem = f"is not in play on level {self.level}"
         loaded = True
         ticks = 60
         if start is not None:
-            # The core takes any bytes of that length, and may then hang: look for the mark first.
+            # The core accepts any bytes of this length, and may then hang: check the mark first.
             loaded = start[:3] == b"FCS" and self._load(start)
             ticks = 1
             problem += ", or the state is of another cartridge"
@@ -833,18 +826,17 @@ class PrinceOfPersia(EmulatorEnv):
 
 
 class Montezuma(EmulatorEnv):
-    """Montezuma's Revenge through ale-py, which brings the game: not in the paper.
+    """Montezuma's Revenge through ale-py, which contains the game. Not in the paper.
 
-    ALE/MontezumaRevenge-v5 without sticky actions (R22) and without its end after 108,000 frames,
-    which rollbacks would reach. ALE's minimal actions, all 18. No full coverage set is known.
+    ALE/MontezumaRevenge-v5 without sticky actions (R22), and without its limit of 108,000 frames,
+    which rollbacks would reach. All 18 actions. The full coverage set is unknown.
     info: room, x, y (ALE pixels), lives, blank.
-    unit() is (room, column, row) of 16 pixels: a tenth of the screen's width, as a plate is of the
-    Prince's room.
+    unit() is (room, column, row) in squares of 16 pixels, a tenth of the screen's width.
     """
 
     unit_name = "units of 16 x 16 pixels"
 
-    def __init__(self, frame_size: int = 96):
+    def __init__(self, frame_size: int = 96, frameskip: int = 4):
         try:
             import ale_py
         except ImportError:
@@ -852,13 +844,13 @@ class Montezuma(EmulatorEnv):
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # no banner
         ale = ale_py.ALEInterface()
         ale.setFloat("repeat_action_probability", 0.0)
-        ale.setInt("random_seed", 0)  # of numbers drawn to no effect, but part of the state
+        ale.setInt("random_seed", 0)  # has no effect, but is part of the state
         ale.loadROM(ale_py.roms.get_rom_path("montezuma_revenge"))
         ale.reset_game()
         self._emulator = ale
         self._state_type = ale_py.ALEState
         self._actions = ale.getMinimalActionSet()
-        self._begin(b"Montezuma", len(self._actions), frame_size)
+        self._begin(b"Montezuma", len(self._actions), frame_size, frameskip)
 
     def _screen(self):
         return self._emulator.getScreenRGB()  # (210, 160, 3)
@@ -887,8 +879,8 @@ class Montezuma(EmulatorEnv):
 def unit_key(unit) -> tuple[int | str, ...] | None:
     """A coverage unit as a hashable tuple of plain ints and strs, or None.
 
-    unit: an int, a str, or a tuple, list or array of them. InputError: anything else. A float is
-    refused, as nan differs from itself and would be a new unit at each step.
+    unit: an int, a str, or a tuple, list or array of them. Raises InputError for anything else: a
+    float nan, for example, differs from itself and would be a new unit at every step.
     """
     if unit is None:
         return None
@@ -914,6 +906,64 @@ def check_action(action: int, count: int) -> None:
         raise InputError(f"there are actions 0 to {count - 1}, and not {action!r}")
 
 
+# ---- Workers -------------------------------------------------------------------------------------
+
+
+class Workers:
+    """An executor of concurrent.futures, or any object with its map(), whose workers each make the
+    environment once. They must be able to import this module, rbexplore and env_fn."""
+
+    def __init__(self, executor: Executor, env_fn: Callable[[], PersistentEnv], seed: int):
+        self.executor = executor
+        self.key = uuid.uuid4().hex  # tells a worker whose environment it has
+        self.env_fn = env_fn
+        self.seed = seed
+
+    def check(self, function, *arguments):
+        """Call function(env, *arguments) in a worker. Raises InputError if that fails, because
+        env_fn cannot be pickled or imported there, for example."""
+        try:
+            list(self.map(function, *([argument] for argument in arguments)))
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(
+                f"the workers cannot make the environment ({type(error).__name__}: {error}): "
+                f"{DEFINE_IT_IN_A_MODULE}"
+            ) from None
+
+    def map(self, function, *columns):
+        """function(env, ...) for each row of the columns, in order."""
+        call = functools.partial(in_worker, self.key, self.env_fn, self.seed, function)
+        try:
+            yield from self.executor.map(call, *columns)
+        except BrokenExecutor as error:
+            raise InputError(
+                f"a worker process died ({error}): it may have run out of memory, or could not "
+                f"import the environment; use fewer workers, or {DEFINE_IT_IN_A_MODULE}"
+            ) from None
+
+
+DEFINE_IT_IN_A_MODULE = (
+    "define the class or function that makes it in a module, not in a notebook, in __main__ or as "
+    "a lambda"
+)
+_kept = {}  # in a worker: the key of the Workers it served last, and their environment
+_one_at_a_time = threading.Lock()  # for executors whose workers are threads
+
+
+def in_worker(key, env_fn, seed, function, *arguments):
+    """function(env, *arguments), with an environment that is made at the first call of a key."""
+    with _one_at_a_time:
+        if key not in _kept:
+            for env in _kept.values():
+                env.close()
+            _kept.clear()
+            _kept[key] = env_fn()
+            _kept[key].reset(seed=seed)
+        return function(_kept[key], *arguments)
+
+
 # ---- The factory by name -------------------------------------------------------------------------
 
 gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
@@ -921,7 +971,7 @@ ENVIRONMENTS = {"maze": Maze, "pop": PrinceOfPersia, "montezuma": Montezuma}
 
 
 def make_env(name: str, **options) -> PersistentEnv:
-    """The environment of that name; options are its constructor's. InputError: unknown ones."""
+    """The environment of this name, made with these options. Raises InputError for unknown ones."""
     if name not in ENVIRONMENTS:
         raise InputError(f"unknown environment {name!r}: there are {', '.join(ENVIRONMENTS)}")
     known = inspect.signature(ENVIRONMENTS[name]).parameters

@@ -1,37 +1,43 @@
-"""RbExplore, as its paper says it: Ugadiarov, Skrynnik, Panov, "Long-Term Exploration in Persistent
-MDPs".
+"""RbExplore, the algorithm of "Long-Term Exploration in Persistent MDPs" (Ugadiarov, Skrynnik,
+Panov, 2021).
 
 The agent explores without rewards. It rolls back to stored snapshots of the environment, clusters
-the states that it meets by a learned similarity R, and starts again from rarely visited clusters.
-An iteration has five steps (section 4). They are the five calls of `RbExplore.iterate`:
+the states it visits by a learned similarity R, and starts again from rarely visited clusters. One
+iteration has five steps (section 4), which are the five calls in `RbExplore.iterate`:
 
-    1  explore            sample M clusters of G, roll back to each, walk with pi_explore
-    2  make_pairs         walk on from L novel states; label pairs of states, full prefixes included
+    1  explore            sample M clusters of G, roll back to each, explore with pi_explore
+    2  make_pairs         explore from at most L novel states; label pairs of states
     3  train_similarity   train R on the pairs of this iteration
-    4  update_graph       add the states of step 1 to G; every 15th iteration merge similar clusters
+    4  update_graph       add the states of step 1 to G; every 15th iteration, merge clusters
     5  train_novelty      train the novelty module (RND) on the states of step 1
 
     symbol              here                         meaning
-    s, snap             State.frame, .snapshot       a state: its observation, the simulator's bytes
-    tau                 Trajectory                   states s_1 ... s_T that follow one another
+    s, snap             State.frame, .snapshot       a state: its observation, and the bytes that
+                                                     restore it in the simulator
+    tau                 Trajectory                   successive states s_1 ... s_T
     pi_explore          walk                         uniform over the actions
     R(s_1, s_2)         SimilarityModel              in [0, 1]: are the two states close in time?
-    n, N                Config.n, Config.N           closer than n: similar; further than N: not
-    G = (V, E)          Graph.clusters, Graph.arcs   clusters and the arcs between them
-    v = (s, snap)       Cluster                      a cluster is its centre; v is its number
+    n, N                Config.n, Config.N           similar: fewer than n steps apart; dissimilar:
+                                                     more than N
+    G = (V, E)          Graph.clusters, Graph.arcs   clusters, and arcs between them
+    v = (s, snap)       Cluster                      a cluster is its centre; in the code v is its
+                                                     number
     E_parent            Graph.E_parent               the arc from v to the cluster it came from
-    theta_sim           Config.theta_sim             threshold of R to join a cluster
-    theta_merge         Config.theta_merge           threshold of R to merge two clusters
-    B, beta, L          B, Config.beta, Config.L     novel states; what is novel; how many are drawn
-    M                   Config.M                     exploration trajectories an iteration
+    theta_sim           Config.theta_sim             a state joins a cluster if R > theta_sim
+    theta_merge         Config.theta_merge           two clusters merge if R > theta_merge
+    B, beta, L          B, Config.beta, Config.L     novel states, their threshold, how many of them
+                                                     are sampled
+    M                   Config.M                     exploration trajectories per iteration
 
-"S4.2-03" is a statement of the paper, and `pytest -k S4_2_03` its test; "R13" is our reading where
-the paper is silent or unclear. The README lists both. A step is an agent step: one action, after
-the frameskip (R1).
+"S4.2-03" is a statement of the paper; `pytest -k S4_2_03` runs its tests. "R13" is our reading of
+a passage where the paper is silent or unclear. The README lists both. A step is an agent step: one
+action, after the frameskip (R1).
 """
 
 import argparse
 import contextlib
+import csv
+import errno
 import functools
 import io
 import json
@@ -44,11 +50,13 @@ import signal
 import sys
 import threading
 import time
-import uuid
-from collections import Counter, deque
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+import warnings
+import zipfile
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
+from typing import NamedTuple
 
 import filelock
 import gymnasium
@@ -57,85 +65,95 @@ import torch
 from gymnasium.wrappers.utils import RunningMeanStd
 from torch import nn
 from torch.nn import functional as F
-from tqdm import tqdm
 
-from envs import InputError, check_contract, make_env, unit_key
+from envs import (
+    ENVIRONMENTS,
+    InputError,
+    PersistentEnv,
+    Workers,
+    make_checked,
+    make_env,
+    unit_key,
+)
 
 # ---------------------------------- configuration (6.1; S6.1-05, S6.1-08, S6.1-09, S6.1-12)
 
 
 def option(default, meaning, low=-math.inf, high=math.inf):
-    """A field of the configuration: what --help says of it, and its range."""
+    """A field of Config: its default, its line in --help, and its range."""
     return field(default=default, metadata={"meaning": meaning, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's configuration: the defaults are its values, where it gives them, else those of
-    our readings; the same for every level.
+    """The paper's configuration, the same for every level. The defaults are the paper's values;
+    where it states none, they follow our readings.
 
-    Raises InputError for a value that cannot work."""
+    Raises InputError for values that cannot work."""
 
-    seed: int = option(0, "every generator is made from it", 0, 2**63)
-    steps: int = option(15_000_000, "agent steps in all, pretraining included (6.2, R2)", 1, 10**12)
-    pretrain_steps: int = option(500_000, "steps of pretraining; then G is reset (6.1)", 0)
-    M: int = option(30, "exploration trajectories an iteration (6.1)", 1, 10**6)
+    seed: int = option(0, "seed of every random generator", 0, 2**63)
+    steps: int = option(15_000_000, "agent steps in total, pretraining included (6.2, R2)", 1)
+    pretrain_steps: int = option(500_000, "steps of pretraining, after which G is reset (6.1)", 0)
+    M: int = option(30, "exploration trajectories per iteration (6.1)", 1)
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
-    L: int = option(1000, "novel states to walk on from, at most, an iteration (6.1)", 0)
+    L: int = option(1000, "most novel states to explore from per iteration (6.1)", 0)
     additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
-    beta: float = option(2.5, "a state is novel above this reward, in deviations (6.1, R4)")
-    n: int = option(5, "pairs closer than this are similar, steps (6.1)", 1)
-    N: int = option(25, "pairs further apart than this are dissimilar, steps (6.1)", 1)
+    beta: float = option(2.5, "a state is novel above this intrinsic reward (6.1, R4)")
+    n: int = option(5, "similar: states fewer than n steps apart (6.1)", 1)
+    N: int = option(25, "dissimilar: states more than N steps apart (6.1)", 1)
     prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
     epochs: int = option(4, "passes of R over the pairs of an iteration (R19)", 1)
-    theta_sim: float = option(0.5, "a state joins a cluster above this R (6.1)", 0, 1)
-    theta_merge: float = option(0.5, "two clusters merge above this R (6.1)", 0, 1)
+    theta_sim: float = option(0.5, "a state joins a cluster if R is above this (6.1)", 0, 1)
+    theta_merge: float = option(0.5, "two clusters merge if R is above this (6.1)", 0, 1)
     merge: bool = option(True, "merge clusters (4.2; off: ablation of 6.3)")
-    merge_every: int = option(15, "iterations from one merge to the next (6.1, R28)", 1)
+    merge_every: int = option(15, "iterations between merges (6.1, R28)", 1)
+    frameskip: int = option(4, "frames of the emulator per step (6.1)", 1, 1000)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
     small_networks: bool = option(
-        False, "small encoders: not ResNet-18 for R (6.1), not Burda's for the others"
+        False, "small encoders instead of ResNet-18 for R (6.1) and Burda et al.'s for RND"
     )
     embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
-    head_width: int = option(512, "width of fully connected layers; the paper gives none", 1)
-    learning_rate: float = option(1e-4, "Adam's (R18)", 0)
-    r_batch: int = option(256, "pairs in a batch of R (R18)", 2)
-    rnd_batch: int = option(256, "states in a batch of RND (R18)", 1)
-    rollout_steps: int = option(16_384, "RND and ICM: steps of an iteration (6.2, R27)", 1)
-    episode_steps: int = option(4_500, "RND and ICM: longest episode, steps (6.2, R27)", 1)
+    head_width: int = option(512, "width of fully connected layers (not in the paper)", 1)
+    learning_rate: float = option(1e-4, "learning rate of Adam (R18)", 0)
+    r_batch: int = option(256, "pairs per batch of R (R18)", 2)
+    rnd_batch: int = option(256, "states per batch of RND (R18)", 1)
+    rollout_steps: int = option(16_384, "RND and ICM agents: steps per iteration (6.2, R27)", 1)
+    episode_steps: int = option(4_500, "RND and ICM agents: longest episode, steps (R27)", 1)
 
     def __post_init__(self):
-        self.check_fields()
+        for f in fields(self):
+            check_field(f, getattr(self, f.name))
         if self.n > self.N:
             raise InputError(
-                f"n is {self.n} and N is {self.N}: similar states are closer than "
-                "dissimilar ones; give n <= N"
+                f"n is {self.n} and N is {self.N}: similar states must be closer than dissimilar "
+                "ones; choose n <= N"
             )
         for name in ("trajectory_steps", "additional_steps"):
             if getattr(self, name) <= self.N:
                 raise InputError(
-                    f"{name} is {getattr(self, name)}: no two states would be more "
-                    f"than N = {self.N} steps apart; give at least {self.N + 1}"
+                    f"{name} is {getattr(self, name)}: no two states would be more than "
+                    f"N = {self.N} steps apart; choose at least {self.N + 1}"
                 )
         if self.pretrain_steps >= self.steps:
             raise InputError(
-                f"pretrain_steps is {self.pretrain_steps} of {self.steps} steps: "
-                "nothing is left to explore; give more steps, or less pretraining"
+                f"pretrain_steps is {self.pretrain_steps} of {self.steps} steps: nothing is left "
+                "for exploration; choose more steps or less pretraining"
             )
 
-    def check_fields(self):
-        for f in fields(self):
-            value = getattr(self, f.name)
-            low = f.metadata["low"]
-            high = f.metadata["high"]
-            whole_number_for_float = f.type is float and type(value) is int
-            if type(value) is not f.type and not whole_number_for_float:
-                raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
-            if not low <= value <= high:
-                raise InputError(f"{f.name} is {value}: give a number from {low:,} to {high:,}")
+
+def check_field(f, value):
+    """Raise InputError unless the value has the type and range of the field."""
+    low = f.metadata["low"]
+    high = f.metadata["high"]
+    whole_number_for_float = f.type is float and type(value) is int
+    if type(value) is not f.type and not whole_number_for_float:
+        raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
+    if not low <= value <= high:
+        raise InputError(f"{f.name} is {value}: choose a number from {low:,} to {high:,}")
 
 
-# What a small image, a small budget and a CPU need; all else is the paper's. n and N: R30.
+# For small images, a small budget and a CPU. Everything else is the paper's. n and N: a step of the
+# maze is a whole tile (R30).
 MAZE = Config(
     steps=100_000,
     pretrain_steps=4_000,
@@ -145,6 +163,7 @@ MAZE = Config(
     additional_steps=20,
     n=2,
     N=10,
+    frameskip=1,
     frame_size=32,
     small_networks=True,
     embedding=64,
@@ -155,215 +174,238 @@ MAZE = Config(
     rollout_steps=1_024,
     episode_steps=150,
 )
-CONFIGS = {"paper": Config(), "maze": MAZE}
+# For a game on a CPU.
+SMALL = replace(
+    MAZE,
+    steps=1_000_000,
+    pretrain_steps=10_000,
+    trajectory_steps=300,
+    L=20,
+    additional_steps=50,
+    n=5,
+    N=25,
+    frameskip=4,
+    frame_size=64,
+    episode_steps=4_500,
+)
+CONFIGS = {"paper": Config(), "maze": MAZE, "small": SMALL}
 
 # --------------------------------------------------------------- the algorithm (4; S4-01 ... S4-07)
 
 
 @dataclass
 class Iteration:
-    """What one iteration did, for whoever prints, traces, saves or tests it."""
+    """The result of one iteration. starts, trajectories, novelty and clusters have one entry per
+    exploration trajectory, in the same order. The compared methods have metrics only."""
 
     metrics: dict
-    trajectories: list = field(default_factory=list)  # of step 1
-    additional: list = field(default_factory=list)  # of step 2
-    pairs: list = field(default_factory=list)  # of step 2: triples (s_1, s_2, y)
-    merged: dict = field(default_factory=dict)  # of step 4: cluster -> what it merged into
+    starts: list[int] = field(default_factory=list)  # step 1: the sampled clusters
+    trajectories: list["Trajectory"] = field(default_factory=list)  # step 1
+    novelty: list[np.ndarray] = field(default_factory=list)  # step 2: each state's reward, (T,)
+    additional: list["Trajectory"] = field(default_factory=list)  # step 2
+    pairs: list[tuple] = field(default_factory=list)  # step 2: triples (s_1, s_2, y)
+    clusters: list[list[int]] = field(default_factory=list)  # step 4: each state's, before merging
+    merged: dict[int, int] = field(default_factory=dict)  # step 4: cluster -> its survivor
 
 
 class RbExplore:
     """The algorithm of section 4.
 
-    env_fn makes the persistent environment (envs.PersistentEnv says what that is). device is where
-    the networks are. executor, one of concurrent.futures, walks the trajectories, with the same
-    result. Processes need an env_fn that pickles; with threads several environments live in one
-    process, which the cartridge's emulator does not allow. Raises InputError for an environment
-    that breaks the contract, or a loss that is not finite."""
+    env_fn: makes the persistent environment (see envs.PersistentEnv).
+    device: where the networks are.
+    executor: a pool of processes that walks the trajectories, with the same result (see
+    envs.Workers); it needs an env_fn that can be pickled.
 
-    def __init__(self, env_fn, config=None, device="cpu", executor=None):
+    Raises InputError for an environment that breaks the contract, and for a loss that is not
+    finite."""
+
+    method = "rbexplore"
+
+    def __init__(
+        self,
+        env_fn: Callable[[], PersistentEnv],
+        config: Config | None = None,
+        device: str = "cpu",
+        executor: Executor | None = None,
+    ):
         self.config = config or Config()
-        self.env_fn = env_fn
-        self.executor = executor
-        self.env = env_fn()
-        check_contract(self.env, self.config.seed)
+        self.env = make_checked(env_fn, self.config.seed)
         frame, _ = self.env.reset(seed=self.config.seed)
         self.initial_state = State(np.array(frame), self.env.snapshot())
         self.initial_unit = unit_key(self.env.unit())
-        # Layers draw first weights from torch's global generator, which is left as it was.
+        # Layers draw their first weights from torch's global generator, which is restored.
         with torch.random.fork_rng(devices=[]):
             self.similarity = SimilarityModel(self.config, frame.shape, device)
             self.novelty = RND(self.config, frame.shape, device)
         self.graph = Graph(self.initial_state)
+        full_coverage = getattr(self.env, "full_coverage", None)
+        self.coverage = Coverage(full_coverage, self.config.steps)
         self.pretraining = True
         self.iteration = 0
-        self.steps = 0
-        self.discovered: dict[tuple, int] = {}  # coverage unit -> step of its first visit
-        self.worker_key = uuid.uuid4().hex  # by which a worker knows whose environment it has
+        self.workers = None
+        if executor is not None:
+            self.workers = Workers(executor, env_fn, self.config.seed)
+            self.workers.check(walk, self.initial_state, 0, 0)
 
     def iterate(self) -> Iteration:
-        """One iteration: the paper's five steps, in the paper's order."""
-        check_budget(self)
-        if self.pretraining and self.steps >= self.config.pretrain_steps:
+        """Run one iteration: the five steps, in the paper's order."""
+        if self.pretraining and self.coverage.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
-        # Made anew each iteration, so that a checkpoint needs no generator; one for each step that
-        # draws, so that what one step draws does not shift the next step.
+        theta_sim = self.theta_sim_now()
+        clusters_before = len(self.graph.clusters)
+        # A new generator per iteration keeps random states out of checkpoints. One generator per
+        # step keeps the draws of one step from shifting those of another.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
-        theta_sim = self.theta_sim_now()  # before any step is taken: it begins at 0 (S6.1-13)
-        first_new = self.graph.next_number
 
-        trajectories = self.explore(rng_1)
-        pairs, additional = self.make_pairs(trajectories, rng_2)
+        starts, trajectories = self.explore(rng_1)
+        pairs, additional, novelty = self.make_pairs(starts, trajectories, rng_2)
         r_metrics = self.train_similarity(pairs, rng_3)
-        merged = self.update_graph(trajectories, theta_sim)
+        clusters, merged = self.update_graph(starts, trajectories, theta_sim)
         rnd_loss = self.train_novelty(trajectories, rng_5)
 
-        novelty = np.concatenate([tau.novelty for tau in trajectories])
-        metrics = {  # a new entry becomes a column of metrics.csv
-            **progress_metrics(self),
+        metrics = {  # the columns of metrics.csv
+            "iteration": self.iteration,
+            "phase": "pretrain" if self.pretraining else "explore",
+            **self.coverage.metrics(),
             "theta_sim": theta_sim,
             "clusters": len(self.graph.clusters),
-            "added": self.graph.next_number - first_new,
+            "added": len(self.graph.clusters) + len(merged) - clusters_before,
             "merged": len(merged),
-            "novel_share": float(np.mean(novelty > self.config.beta)),
+            "novel_share": share_above(self.config.beta, novelty),
             "additional": len(additional),
             **r_metrics,
             "rnd_loss": rnd_loss,
         }
-        return Iteration(metrics, trajectories, additional, pairs, merged)
+        return Iteration(
+            metrics, starts, trajectories, novelty, additional, pairs, clusters, merged
+        )
 
-    def run(self):
-        """Iterate until the budget of steps is spent."""
-        while self.steps < self.config.steps:
+    def run(self) -> "RbExplore":
+        """Iterate until the budget of steps is spent. Returns the algorithm itself."""
+        while self.coverage.steps < self.config.steps:
             self.iterate()
         return self
 
     def restart(self):
-        """The end of pretraining (6.1; S6.1-15): G is reset to the initial state, R and RND are
-        kept (R6), and coverage starts (R2)."""
+        """End pretraining (6.1; S6.1-15): reset G to the initial state and start counting coverage
+        (R2). R, RND, their optimisers and the count of iterations are kept (R6, R31)."""
         self.pretraining = False
         self.graph = Graph(self.initial_state)
-        if self.initial_unit is not None:
-            self.discovered[self.initial_unit] = self.steps
+        self.coverage.visit(self.initial_unit)
 
     def theta_sim_now(self):
-        """The threshold; in pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
+        """theta_sim; during pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
         if not self.pretraining:
             return self.config.theta_sim
-        return self.config.theta_sim * self.steps / self.config.pretrain_steps
+        return self.config.theta_sim * self.coverage.steps / self.config.pretrain_steps
 
     def explore(self, rng):
-        """Step 1: sample M clusters, roll back to each, explore (S4-01, S6.1-06, S6.1-11).
-
-        Clusters are drawn with replacement, as G begins with a single one (R12)."""
+        """Step 1: sample M clusters, roll back to each, explore (S4-01, S6.1-06, S6.1-11). Returns
+        the numbers of the sampled clusters, and a trajectory from each."""
         clusters, probabilities = self.graph.sampling_distribution()
-        sampled = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
-        centres = [self.graph.clusters[v] for v in sampled]
+        # With replacement, because G starts with a single cluster (R12).
+        starts = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
+        centres = [self.graph.clusters[v] for v in starts]
         covers = not self.pretraining
         trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
-        for tau, v in zip(trajectories, sampled, strict=False):  # fewer, where the steps ended
-            tau.start = v
-            tau.full_prefix = self.graph.full_prefix(v)
-        check_lengths(trajectories)
+        return starts, trajectories
+
+    def collect(self, states, max_steps, covers, rng):
+        """Roll back to each state and walk at most `max_steps` steps. Every step counts (R2);
+        `covers` says whether the units visited count as coverage (R25). Returns the
+        trajectories."""
+        seeds = rng.integers(2**63, size=len(states)).tolist()
+        trajectories = list(progress(self.walks(states, seeds, max_steps), "walk", len(states)))
+        for tau in trajectories:
+            for unit in tau.units:
+                self.coverage.count(unit, covers)
         return trajectories
 
-    def collect(self, starts, max_steps, covers, rng):
-        """Roll back to each state and walk at most `max_steps` steps.
+    def walks(self, states, seeds, max_steps):
+        """A walk from each state, made here or by the workers. Yields trajectories."""
+        limits = [max_steps] * len(states)
+        if self.workers is None:
+            return map(functools.partial(walk, self.env), states, seeds, limits)
+        return self.workers.map(walk, states, seeds, limits)
 
-        Each step counts, whatever it serves (R2), and none is taken beyond the end of pretraining
-        or of the budget (S6.2-04), so there may be fewer trajectories then. covers: whether its
-        steps count for coverage (R25)."""
-        end = self.config.pretrain_steps if self.pretraining else self.config.steps
-        seeds = rng.integers(2**63, size=len(starts)).tolist()
-        trajectories = []
-        while len(trajectories) < len(starts) and self.steps < end:
-            left = end - self.steps
-            limit = min(max_steps, left)
-            # Workers walk side by side, so only those are begun that fit at full length; what the
-            # shorter ones leave is for the next round.
-            fitting = max(1, left // max_steps)
-            first = len(trajectories)
-            jobs = [(starts[k], seeds[k], limit) for k in range(first, len(starts))][:fitting]
-            for tau in progress(walk_all(self, jobs), "walk", len(jobs)):
-                for unit in tau.units:
-                    self.steps += 1
-                    if covers and unit is not None:
-                        self.discovered.setdefault(unit, self.steps)
-                trajectories.append(tau)
-        return trajectories
-
-    def make_pairs(self, trajectories, rng):
-        """Step 2: pairs of exploration and of additional trajectories (S4-02), and pairs with their
-        full prefixes (S4.1-09, R29). Returns the pairs and the additional trajectories."""
-        additional = self.walk_on_from_novel_states(trajectories, rng)
+    def make_pairs(self, starts, trajectories, rng):
+        """Step 2: label pairs of exploration and of additional trajectories (S4-02), and pairs of
+        exploration trajectories with the full prefixes of their start clusters (S4.1-09, R29).
+        Returns the pairs, the additional trajectories, and the novelty of each exploration
+        trajectory's states."""
+        additional, novelty = self.explore_from_novel_states(trajectories, rng)
         pairs = []
         for tau in trajectories + additional:
             pairs += pairs_within(tau.frames, self.config.n, self.config.N, rng)
-        # In a loop of its own: without it the other pairs are the same (S6.3-02).
+        # A separate loop, so that disabling prefixes leaves the random draws of the other pairs
+        # unchanged (S6.3-02).
         if self.config.prefix:
-            for tau in trajectories + additional:
-                pairs += pairs_with_prefix(tau.frames, tau.full_prefix, self.config.N, rng)
-        return pairs, additional
+            for start, tau in zip(starts, trajectories, strict=True):
+                full_prefix = self.graph.full_prefix(start)
+                pairs += pairs_with_prefix(tau.frames, full_prefix, self.config.N, rng)
+        return pairs, additional, novelty
 
-    def walk_on_from_novel_states(self, trajectories, rng):
-        """Put the novel states into B, sample L of them, walk on from these (S4.2-15 ... S4.2-18).
-
-        The RND of the iteration before decides what is novel. B holds the novel states of this
-        iteration only (R5). The walks serve R alone."""
-        B = []  # a novel state: its trajectory, and its index there
-        for tau in trajectories:
-            tau.novelty = self.novelty.reward(tau.frames)
-            B += [(tau, i) for i in np.flatnonzero(tau.novelty > self.config.beta)]  # S4.2-16
-        sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]  # S4.2-17
-        novel_states = [State(tau.frames[i], tau.snapshots[i]) for tau, i in sample]
-        additional = self.collect(novel_states, self.config.additional_steps, False, rng)
-        for walked, (tau, i) in zip(additional, sample, strict=False):
-            walked.start = tau.start
-            # The full prefix goes on from tau's, which ends with its s_1, to the novel state (R29).
-            walked.full_prefix = tau.full_prefix[:-1] + list(tau.frames[: i + 1])
-        return additional
+    def explore_from_novel_states(self, trajectories, rng):
+        """Put all novel states into B, sample L of them, and explore from those (S4.2-15 ...
+        S4.2-18). B holds the novel states of this iteration only (R5). Returns the additional
+        trajectories, and the novelty of each exploration trajectory's states."""
+        if self.config.L == 0:
+            return [], []
+        novelty = [self.novelty.reward(tau.frames) for tau in trajectories]
+        B = []
+        for tau, reward in zip(trajectories, novelty, strict=True):
+            for i in np.flatnonzero(reward > self.config.beta):
+                B.append(State(tau.frames[i], tau.snapshots[i]))
+        sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]
+        additional = self.collect(sample, self.config.additional_steps, False, rng)
+        return additional, novelty
 
     def train_similarity(self, pairs, rng):
-        """Step 3: train R on this iteration's pairs and no others (S4-03, S4-06). Returns metrics:
-        how often it was right on them before, while they were unseen, and its loss."""
-        true_positive, true_negative = self.similarity.rates(pairs, rng)
+        """Step 3: train R on the pairs of this iteration only (S4-03, S4-06). Returns its loss, and
+        its accuracy on these pairs before the training."""
+        # The diagnostic has a generator of its own, so that it does not shift what R draws.
+        true_positive_rate, true_negative_rate = self.similarity.rates(pairs, rng.spawn(1)[0])
         loss = self.similarity.fit(pairs, rng)
-        return {"r_tpr": true_positive, "r_tnr": true_negative, "r_loss": loss}
+        return {"r_tpr": true_positive_rate, "r_tnr": true_negative_rate, "r_loss": loss}
 
-    def update_graph(self, trajectories, theta_sim):
-        """Step 4: add the states of the exploration trajectories to G; every 15th iteration merge
-        (S4-04, S6.1-10, S6.3-01). Returns which cluster merged into which."""
-        self.graph.embed_centres(self.similarity)  # R has changed: the old embeddings are stale
-        for tau in progress(trajectories, "update G"):
-            self.graph.add_trajectory(tau, self.similarity, theta_sim)
+    def update_graph(self, starts, trajectories, theta_sim):
+        """Step 4: add the states of the exploration trajectories to G; every 15th iteration, merge
+        (S4-04, S6.1-10, S6.3-01). Returns the cluster of each state of each trajectory, and which
+        cluster merged into which."""
+        self.graph.embed_centres(self.similarity)  # by the R just trained (S4-03)
+        clusters = []
+        for start, tau in zip(starts, progress(trajectories, "update G"), strict=True):
+            clusters.append(self.graph.add_trajectory(start, tau, self.similarity, theta_sim))
+        merged = {}
         if self.config.merge and self.iteration % self.config.merge_every == 0:
-            return self.graph.merge(self.similarity, self.config.theta_merge)
-        return {}
+            merged = self.graph.merge(self.similarity, self.config.theta_merge)
+        return clusters, merged
 
     def train_novelty(self, trajectories, rng):
-        """Step 5: train RND, last, on the states of the exploration trajectories and no others
-        (S4-05). Returns its loss."""
+        """Step 5: train RND on the states of the exploration trajectories only (S4-05). Returns its
+        loss; None where L is 0, because novelty then serves nothing."""
+        if self.config.L == 0:
+            return None
         return self.novelty.fit([tau.frames for tau in trajectories], rng)
 
-    def state_dict(self):
-        """All that a run needs to go on, as plain data and tensors."""
+    def state_dict(self) -> dict:
+        """The complete state of the algorithm, as plain data and tensors."""
         return {
             "pretraining": self.pretraining,
             "iteration": self.iteration,
-            "steps": self.steps,
-            "discovered": dict(self.discovered),
+            "coverage": self.coverage.state_dict(),
             "similarity": self.similarity.state_dict(),
             "novelty": self.novelty.state_dict(),
             "graph": self.graph.state_dict(),
         }
 
-    def load_state_dict(self, state):
-        """Take over the state of a run of the same configuration and environment."""
+    def load_state_dict(self, state: dict) -> None:
+        """Restore the state of an algorithm of the same configuration and environment."""
         self.pretraining = state["pretraining"]
         self.iteration = state["iteration"]
-        self.steps = state["steps"]
-        self.discovered = dict(state["discovered"])
+        self.coverage.load_state_dict(state["coverage"])
         self.similarity.load_state_dict(state["similarity"])
         self.novelty.load_state_dict(state["novelty"])
         self.graph.load_state_dict(state["graph"])
@@ -382,25 +424,20 @@ class State:
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state, which cannot be returned to, is
-    not stored (R10)."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state cannot be returned to and is not
+    stored (R10)."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
     actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
-    units: list[tuple | None]  # the coverage unit after each step: as many as steps were taken
-    ended: bool  # by the environment, and not by the number of steps
-    start: int = 0  # the cluster it began from; of an additional one: that its exploration did
-    # Frames of the full prefix s_init ... s_1; empty of an exploration from the initial cluster.
-    full_prefix: list[np.ndarray] = field(default_factory=list)
-    novelty: np.ndarray | None = None  # (T,) intrinsic reward of each state, from step 2
-    clusters: list[int] = field(default_factory=list)  # T; of each state in step 4, before merges
+    units: list[tuple | None]  # the coverage unit after each step: one entry per step taken
+    terminated: bool
+    truncated: bool
 
 
-def walk(env, start, seed, max_steps):
+def walk(env: PersistentEnv, start: State, seed: int, max_steps: int) -> Trajectory:
     """Roll back to `start` and follow pi_explore, uniform over the actions (6.1; S4.2-02), for
-    `max_steps` steps or to the end of the episode (S6.1-07). The result depends on these arguments
-    alone."""
+    `max_steps` steps or until the episode ends (S6.1-07)."""
     rng = np.random.default_rng(seed)
     roll_back(env, start)
     frames = [start.frame]
@@ -408,94 +445,60 @@ def walk(env, start, seed, max_steps):
     actions = [b""]
     units = []
     since_state = b""  # the actions since the last state
-    ended = False
-    while len(units) < max_steps and not ended:
+    terminated = False
+    truncated = False
+    while len(units) < max_steps and not terminated and not truncated:
         action = int(rng.integers(env.action_space.n))
         frame, _, terminated, truncated, info = env.step(int(env.action_space.start) + action)
         units.append(unit_key(env.unit()))
         since_state += bytes([action])
-        ended = bool(terminated or truncated)
-        blank = info.get("blank", False)  # a transition screen is stepped and counted (R24)
+        blank = info.get("blank", False)  # a transition screen counts as a step, not a state (R24)
         if not terminated and not blank:
             frames.append(np.array(frame))
             snapshots.append(env.snapshot())
             actions.append(since_state)
             since_state = b""
-    return Trajectory(np.stack(frames), snapshots, actions, units, ended)
+    return Trajectory(np.stack(frames), snapshots, actions, units, terminated, truncated)
 
 
 def roll_back(env, state):
-    """Return to a state, at no step (S3.2-02). Raises InputError if the frame is another one
-    (S4-01)."""
+    """Return to a state without an environment step (S3.2-02). Raises InputError if the environment
+    shows another frame (S4-01)."""
     if not np.array_equal(env.restore(state.snapshot), state.frame):
         raise InputError(
-            "restore() did not give the frame of its snapshot again: part of the "
-            "state is not in the snapshot; see PersistentEnv in envs.py"
-        )
-
-
-def walk_all(algorithm, jobs):
-    """`walk` for each (start, seed, max_steps), in order: here, or in the executor's workers."""
-    if algorithm.executor is None:
-        return (walk(algorithm.env, *job) for job in jobs)
-    remote = functools.partial(walk_in_worker, algorithm.worker_key, algorithm.env_fn)
-    return algorithm.executor.map(remote, jobs)
-
-
-_worker = threading.local()  # the environment of this process or thread, and whose it is
-
-
-def walk_in_worker(owner, env_fn, job):
-    """`walk` in an environment that is made at the first job of its owner, and kept."""
-    if getattr(_worker, "owner", None) != owner:
-        if hasattr(_worker, "env"):
-            _worker.env.close()
-        _worker.env = env_fn()
-        _worker.env.reset()
-        _worker.owner = owner
-    return walk(_worker.env, *job)
-
-
-def check_lengths(trajectories):
-    """Raise InputError where more than 90 % end at their first step, as they do behind a time
-    limit. Fewer than ten trajectories, as the end of the budget leaves, are not judged."""
-    at_once = sum(tau.ended and len(tau.units) == 1 for tau in trajectories)
-    if len(trajectories) >= 10 and at_once > 0.9 * len(trajectories):
-        raise InputError(
-            f"{at_once} of {len(trajectories)} trajectories ended at their first "
-            "step: is there a time limit, which a rollback does not set back? take "
-            "it out"
+            "restore() returned a different frame from the one stored with the snapshot: part of "
+            "the state is not in the snapshot; see PersistentEnv in envs.py"
         )
 
 
 # ------------------------------------------ step 2: training pairs (4.1, 4.2; S4.1-02 ... S4.1-09)
 
-# A pair is a triple (s_1, s_2, y): two frames, and y = 1 where they are similar (S4.1-07).
+# A pair is a triple (s_1, s_2, y): two frames, and y = 1 if they are similar (S4.1-07).
 
 
 def pairs_within(frames, n, N, rng):
-    """Figure 2 (a), (b): for each state of a trajectory (T, H, W) a similar one, and a dissimilar
-    one if there is any, each uniform among those of the same trajectory (R17)."""
+    """Figure 2 (a, b): for each state of a trajectory (T, H, W), one similar state and, if there is
+    any, one dissimilar state, each uniform among those of the same trajectory (R17)."""
     pairs = []
     position = np.arange(len(frames))
     for i in range(len(frames)):
         distance = np.abs(position - i)
-        similar = np.flatnonzero(distance < n)  # S4.1-03; i itself included, as 0 < n (R30)
+        similar = np.flatnonzero(distance < n)  # S4.1-03; i itself included, because 0 < n
         pairs.append((frames[i], frames[rng.choice(similar)], 1))
-        dissimilar = np.flatnonzero(distance > N)  # S4.1-04; between the two none (S4.1-05)
+        dissimilar = np.flatnonzero(distance > N)  # S4.1-04; distances n ... N: no label (S4.1-05)
         if len(dissimilar) > 0:
             pairs.append((frames[i], frames[rng.choice(dissimilar)], 0))
     return pairs
 
 
 def pairs_with_prefix(frames, full_prefix, N, rng):
-    """Figure 2 (c): for each state of a trajectory (T, H, W) a state of its full prefix, if there
-    is any, uniform among those more than N steps away along the joined path (S4.2-22, S4.2-23,
-    R16)."""
+    """Figure 2 (c): for each state of a trajectory (T, H, W), one state of its full prefix, if
+    there is any, uniform among those more than N steps away along the joined path (S4.2-22,
+    S4.2-23, R16)."""
     pairs = []
     position = np.arange(len(full_prefix))
     for i in range(len(frames)):
-        # The prefix ends with s_1, with which the trajectory begins. An empty one gives no pairs.
+        # The last state of the prefix is s_1, the first of the trajectory.
         distance = (len(full_prefix) - 1 + i) - position
         distant = np.flatnonzero(distance > N)
         if len(distant) > 0:
@@ -504,7 +507,7 @@ def pairs_with_prefix(frames, full_prefix, N, rng):
 
 
 def balanced(pairs, rng):
-    """As many similar as dissimilar pairs, drawn anew at each call, in random order (R17)."""
+    """Equally many similar and dissimilar pairs, drawn anew at each call, in random order (R17)."""
     similar = [pair for pair in pairs if pair[2] == 1]
     dissimilar = [pair for pair in pairs if pair[2] == 0]
     size = min(len(similar), len(dissimilar))
@@ -514,8 +517,8 @@ def balanced(pairs, rng):
 
 
 def in_either_order(pair, rng):
-    """The pair, or its states swapped: a prefix state that always came second would give its class
-    away (R17)."""
+    """The pair, or the pair with its states swapped: a fixed order would reveal the label, because
+    a prefix state would always be the second (R17)."""
     s_1, s_2, y = pair
     return (s_2, s_1, y) if rng.random() < 0.5 else pair
 
@@ -530,17 +533,19 @@ def stack_pairs(pairs):
 
 
 class SimilarityModel(nn.Module):
-    """R_w(s_1, s_2): one encoder embeds both frames, four fully connected layers classify the two
-    embeddings (6.1). It is in evaluation mode except during `fit`, so that R of a pair depends on
-    that pair alone (S4.1-01). shape: of a frame, (H, W) or (H, W, C)."""
+    """R_w(s_1, s_2): one encoder embeds both frames; four fully connected layers classify the two
+    embeddings (6.1). The model is in evaluation mode except during `fit`, so that R of a pair
+    depends on that pair alone (S4.1-01).
 
-    def __init__(self, config, shape, device="cpu"):
+    shape: of a frame, (H, W) or (H, W, C)."""
+
+    def __init__(self, config: Config, shape: tuple[int, ...], device: str = "cpu"):
         super().__init__()
         self.epochs = config.epochs
         self.batch_size = config.r_batch
         self.device = device
         if config.small_networks:
-            self.encoder = conv_encoder(SMALL, shape, config.embedding, batch_norm=True)
+            self.encoder = conv_encoder(SMALL_LAYERS, shape, config.embedding, batch_norm=True)
         else:
             self.encoder = ResNet18(channels_of(shape), config.embedding)
         width = config.head_width
@@ -551,18 +556,18 @@ class SimilarityModel(nn.Module):
             *dense(width, 1),
         )
         initialise(self, config.seed, 0)
-        self.to(device, memory_format=torch.channels_last)  # which is faster
+        self.to(device, memory_format=torch.channels_last)  # the faster layout
         self.eval()
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate, fused=True)
 
     def forward(self, s_1, s_2):
-        """Frames (B, H, W) twice -> logits of R (B,)."""
+        """Two batches of frames (B, H, W) -> logits of R (B,)."""
         frames = to_input(np.concatenate([s_1, s_2]), self.device)  # (2B, C, H, W)
         e_1, e_2 = self.encoder(frames).chunk(2)  # (B, d) each
         return self.logits(e_1, e_2)
 
     def logits(self, e_1, e_2):
-        """Embeddings (B, d) twice -> (B,)."""
+        """Two batches of embeddings (B, d) -> logits of R (B,)."""
         return self.head(torch.cat([e_1, e_2], dim=1)).squeeze(1)
 
     @torch.no_grad()
@@ -573,13 +578,13 @@ class SimilarityModel(nn.Module):
 
     @torch.no_grad()
     def score(self, e_1, e_2):
-        """R of embeddings (K, d) with as many others, or with one (d,) -> (K,) in [0, 1]."""
+        """R of embeddings (K, d) and others, (K, d) or a single one (d,) -> (K,) in [0, 1]."""
         return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
     def fit(self, pairs, rng):
         """Minimise the binary cross-entropy in `epochs` passes (R19), each over a balanced draw of
-        its own. Returns the mean loss of the last; None where there are no pairs of both
-        classes."""
+        its own. Returns the mean loss of the last pass; None, and leaves R unchanged, unless there
+        are pairs of both classes."""
         losses = []
         self.train()
         try:
@@ -588,21 +593,23 @@ class SimilarityModel(nn.Module):
                 for batch in progress(batches(balanced(pairs, rng), self.batch_size), "train R"):
                     losses.append(self.update(*stack_pairs(batch)))
         finally:
-            self.eval()  # also after Ctrl-C
+            self.eval()  # also after an interruption
         return float(np.mean(losses)) if losses else None
 
     def update(self, s_1, s_2, y):
-        """One step on frames (B, H, W) twice and labels (B,). Returns the loss before it, the mean
-        of -y log R - (1 - y) log(1 - R) (S4.1-08)."""
+        """One optimiser step on frames (B, H, W) twice and labels (B,). Returns the loss before it,
+        the mean of -y log R - (1 - y) log(1 - R) (S4.1-08)."""
         labels = torch.from_numpy(y).float().to(self.device)
         loss = F.binary_cross_entropy_with_logits(self(s_1, s_2), labels)
         gradient_step(self.optimiser, loss, "R", max_norm=1.0)  # R18
         return loss.item()
 
     def rates(self, pairs, rng):
-        """How often R > 0.5 is right, of at most 1,000 pairs: true positive rate and true negative
-        rate; None and None where there are no pairs of both classes."""
-        chosen = balanced(pairs, rng)[:1000]
+        """The true positive and true negative rates of R > 0.5, over at most 1,000 pairs whose
+        frames differ: identical frames are similar by construction, and would hide whether R
+        generalises. None, None unless there are such pairs of both classes."""
+        differing = [pair for pair in pairs if not np.array_equal(pair[0], pair[1])]
+        chosen = balanced(differing, rng)[:1000]
         if not chosen:
             return None, None
         s_1, s_2, y = stack_pairs(chosen)
@@ -610,7 +617,7 @@ class SimilarityModel(nn.Module):
         return float(np.mean(R[y == 1] > 0.5)), float(np.mean(R[y == 0] <= 0.5))
 
     def get_extra_state(self):
-        """What PyTorch's state_dict() keeps beside the weights."""
+        """What PyTorch's state_dict() stores beside the weights."""
         return self.optimiser.state_dict()
 
     def set_extra_state(self, state):
@@ -624,130 +631,140 @@ class SimilarityModel(nn.Module):
 class Cluster(State):
     """v = (s, snap): the centre of a cluster, and its visits."""
 
-    visits: int = 0  # states assigned to it, its own centre included (R11)
+    visits: int = 1  # states assigned to the cluster; the first is its centre (R11)
 
 
 @dataclass(frozen=True)
 class ParentArc:
-    """An arc of E_parent, from a cluster to its parent, with the prefix as it was walked."""
+    """An arc of E_parent from a cluster to its parent, with the stored prefix."""
 
     parent: int
-    prefix: np.ndarray  # (k, H, W) from the parent's centre to the cluster's, both included
-    actions: bytes  # they lead from the one to the other; numbered from 0
+    prefix: np.ndarray  # (k, H, W), from the parent's centre to the cluster's, both included
+    actions: bytes  # the actions that lead from the one to the other, counted from 0
 
 
 class Graph:
-    """G. Clusters are numbered in the order of creation; number 0 is the initial one (S4.2-11).
-    In what follows v, u, later and earlier are such numbers."""
+    """G. Clusters are numbered in the order of their creation; number 0 is the initial cluster
+    (S4.2-11). Below, v, u, later and earlier are such numbers."""
 
-    def __init__(self, initial_state):
-        initial = Cluster(initial_state.frame, initial_state.snapshot, visits=1)
+    def __init__(self, initial_state: State):
+        initial = Cluster(initial_state.frame, initial_state.snapshot)
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
         self.adjacent: dict[int, set[int]] = {0: set()}  # predecessors and successors (R8)
-        # For each cluster but 0, and its ancestors, merged or not. No merge changes an entry, so
-        # that distances along a prefix stay true, and its actions are pi^p of section 3.2 (R15).
+        # One arc for each cluster but 0, and for its ancestors, merged or not. Merging changes no
+        # arc, so that every full prefix remains a path that was walked (R15).
         self.E_parent: dict[int, ParentArc] = {}
-        self.next_number = 1  # of the cluster made next
-        self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the R of now
+        self.next_number = 1  # of the next cluster; numbers are not reused
+        self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the current R
 
     def sampling_distribution(self):
-        """sigma: the clusters, each with a probability inverse to its visits (6.1; S4.2-12)."""
+        """sigma: the clusters, and for each a probability inversely proportional to its visits
+        (6.1; S4.2-12)."""
         weights = np.array([1 / cluster.visits for cluster in self.clusters.values()])
         return list(self.clusters), weights / weights.sum()
 
     def embed_centres(self, similarity):
-        """Embed all centres by the R of now (S4-03)."""
+        """Embed all centres by the current R (S4-03)."""
         frames = np.stack([cluster.frame for cluster in self.clusters.values()])
         self.embeddings = dict(zip(self.clusters, similarity.embed(frames), strict=True))
 
-    def most_similar(self, ids, e_i, similarity, theta):
-        """Of these clusters the one whose centre s has the greatest R(s, s_i), if that is above
-        theta, else None (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
-        centres = torch.stack([self.embeddings[v] for v in ids])  # (K, d)
+    def most_similar(self, candidates, e_i, similarity, theta):
+        """Among these clusters, the one whose centre s has the greatest R(s, s_i), if that is above
+        theta; else None (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
+        centres = torch.stack([self.embeddings[v] for v in candidates])  # (K, d)
         scores = similarity.score(centres, e_i)  # (K,)
         best = int(scores.argmax())
-        return ids[best] if scores[best] > theta else None
+        return candidates[best] if scores[best] > theta else None
 
-    def add_trajectory(self, tau, similarity, theta_sim):
-        """Each state in order joins a cluster or makes one (S4.2-06); successive states of
-        different clusters make an arc (S4.2-07, S4.2-08). tau.clusters then tells where each state
-        went."""
+    def add_trajectory(self, start, tau, similarity, theta_sim):
+        """Assign each state, in order, to a cluster or to a new one (S4.2-06), and add an arc where
+        successive states belong to different clusters (S4.2-07, S4.2-08). start: the cluster from
+        which tau began. Returns the cluster of each state (T)."""
         embeddings = similarity.embed(tau.frames)  # (T, d)
-        tau.clusters = [tau.start]  # s_1 is its centre (R9)
-        self.clusters[tau.start].visits += 1
-        parent_at = 0  # index in tau of the parent's centre: the cluster last made, else s_1 (R13)
+        clusters = [start]  # the first state is the centre of its start cluster (R9)
+        self.clusters[start].visits += 1
+        # The parent of a new cluster is the cluster last created on this trajectory, else its start
+        # (R13).
+        parent = start
+        parent_index = 0  # of the parent's centre in tau
         for i in range(1, len(tau.frames)):
-            previous = tau.clusters[i - 1]
+            previous = clusters[-1]
             v = self.find(embeddings[i], previous, similarity, theta_sim)
             if v is None:
-                v = self.create(tau, i, parent_at, embeddings[i])
-                parent_at = i
-            self.clusters[v].visits += 1  # S4.2-09; a new one had none
+                # Copied, because a view would keep the whole trajectory in memory.
+                prefix = tau.frames[parent_index : i + 1].copy()
+                actions = b"".join(tau.actions[parent_index + 1 : i + 1])
+                arc = ParentArc(parent, prefix, actions)
+                v = self.create(tau.snapshots[i], arc, embeddings[i])
+                parent = v
+                parent_index = i
+            else:
+                self.clusters[v].visits += 1  # S4.2-09
             if v != previous:
                 self.add_arc(previous, v, visits=1)
-            tau.clusters.append(v)
+            clusters.append(v)
+        return clusters
 
     def find(self, e_i, previous, similarity, theta_sim):
-        """The cluster to which s_i belongs: the most similar of the previous one and those adjacent
-        to it (S4.2-13, R8), else of all (R7), else None (S4.2-05). e_i: its embedding (d,)."""
+        """The cluster to which s_i belongs: the most similar among the previous state's cluster and
+        those adjacent to it (S4.2-13, R8), else among all (R7), else None (S4.2-05). e_i: the
+        embedding (d,) of s_i."""
         nearby = sorted({previous} | self.adjacent[previous])
         found = self.most_similar(nearby, e_i, similarity, theta_sim)
         if found is None:
             found = self.most_similar(list(self.clusters), e_i, similarity, theta_sim)
         return found
 
-    def create(self, tau, i, parent_at, e_i):
-        """Make a cluster of state i of tau, embedded as e_i (d,), and its arc to the parent, whose
-        centre is state parent_at of tau (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
+    def create(self, snapshot, arc, embedding):
+        """Create a cluster whose centre is the last state of the arc's prefix, and add the arc to
+        E_parent (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
         v = self.next_number
         self.next_number += 1
-        prefix = tau.frames[parent_at : i + 1].copy()  # a view would keep the whole of tau
-        actions = b"".join(tau.actions[parent_at + 1 : i + 1])
-        self.clusters[v] = Cluster(prefix[-1], tau.snapshots[i])
-        self.embeddings[v] = e_i
+        self.clusters[v] = Cluster(arc.prefix[-1], snapshot)
+        self.embeddings[v] = embedding
         self.adjacent[v] = set()
-        self.E_parent[v] = ParentArc(tau.clusters[parent_at], prefix, actions)
+        self.E_parent[v] = arc
         return v
 
     def add_arc(self, start, end, visits):
-        """Add so many visits to the arc (start, end) (S4.2-10)."""
+        """Add the arc (start, end), or visits to it (S4.2-10)."""
         self.arcs[start, end] = self.arcs.get((start, end), 0) + visits
         self.adjacent[start].add(end)
         self.adjacent[end].add(start)
 
     def lineage(self, v):
-        """v and its ancestors but for the initial cluster, oldest first (S4.2-19)."""
+        """v and its ancestors except the initial cluster, oldest first (S4.2-19)."""
         line = []
         while v != 0:
             line.append(v)
             v = self.E_parent[v].parent
         return line[::-1]
 
-    def full_prefix(self, v):
-        """The frames of s_init ... s on the way to the centre s of v, in the order of time; empty
-        for the initial cluster (S4.2-21)."""
+    def full_prefix(self, v: int) -> list[np.ndarray]:
+        """The frames from s_init to the centre of v in the order of time; empty for the initial
+        cluster (S4.2-21)."""
         if v == 0:
             return []
         frames = [self.clusters[0].frame]
         for u in self.lineage(v):
-            frames += list(self.E_parent[u].prefix[1:])  # without the parent's centre
+            frames += list(self.E_parent[u].prefix[1:])  # the parent's centre is there already
         return frames
 
-    def actions_to(self, v):
-        """The actions that lead from s_init to the centre of v: pi^p of section 3.2 (S3.2-03)."""
+    def actions_to(self, v: int) -> bytes:
+        """The actions that lead from s_init to the centre of v, counted from 0: pi^p of section 3.2
+        (S3.2-03)."""
         return b"".join(self.E_parent[u].actions for u in self.lineage(v))
 
     def merge(self, similarity, theta_merge):
-        """In the order of creation, each cluster merges into the most similar surviving earlier one
-        with R(earlier, later) > theta_merge (S4.2-24, S4.2-25; our reading of all pairs, R14). The
-        earlier one keeps its centre (S4.2-28) and inherits visits (S4.2-27) and arcs. Returns
-        {later: earlier}."""
+        """In the order of creation, compare each cluster with the surviving earlier ones, and merge
+        it into the one with the greatest R(earlier, later) if that is above theta_merge (S4.2-24,
+        S4.2-25). A cluster that was absorbed is not compared again (R14). The earlier cluster keeps
+        its centre (S4.2-28) and inherits visits (S4.2-27) and arcs. Returns {later: earlier}."""
         merged = {}
         survivors = [0]
         for later in list(self.clusters)[1:]:
-            e_later = self.embeddings[later]
-            earlier = self.most_similar(survivors, e_later, similarity, theta_merge)
+            earlier = self.most_similar(survivors, self.embeddings[later], similarity, theta_merge)
             if earlier is None:
                 survivors.append(later)
             else:
@@ -755,15 +772,15 @@ class Graph:
         for later, earlier in merged.items():
             absorbed = self.clusters.pop(later)
             self.clusters[earlier].visits += absorbed.visits
-        self.redirect_arcs(self.arcs, merged)
-        # Of E_parent only the lineages of living clusters are kept (R15; S4.2-29).
+        self.set_arcs(self.arcs, merged)
+        # Keep the arcs of E_parent that lead from living clusters to s_init (R15; S4.2-29).
         needed = {u for v in self.clusters for u in self.lineage(v)}
         self.E_parent = {v: arc for v, arc in self.E_parent.items() if v in needed}
         return merged
 
-    def redirect_arcs(self, arcs, merged):
-        """Whatever arc was incident to a cluster is incident to the one it merged into; between the
-        two there is none (S4.2-26)."""
+    def set_arcs(self, arcs, merged):
+        """Replace E by these arcs: move the arcs of merged clusters to their survivors and drop
+        self-loops (S4.2-26)."""
         self.arcs = {}
         self.adjacent = {v: set() for v in self.clusters}
         for (start, end), visits in arcs.items():
@@ -773,8 +790,8 @@ class Graph:
                 self.add_arc(start, end, visits)
 
     def state_dict(self):
-        """G without its embeddings, which each iteration makes anew. Frames are tensors: PyTorch
-        loads no arrays with weights_only."""
+        """G without its embeddings, which every iteration computes anew. Frames are stored as
+        tensors, because torch.load with weights_only refuses arrays."""
         clusters = {}
         for v, cluster in self.clusters.items():
             clusters[v] = (torch.from_numpy(cluster.frame), cluster.snapshot, cluster.visits)
@@ -796,7 +813,7 @@ class Graph:
         for v, (parent, prefix, actions) in state["E_parent"].items():
             self.E_parent[v] = ParentArc(parent, prefix.numpy(), actions)
         self.next_number = state["next_number"]
-        self.redirect_arcs(state["arcs"], merged={})
+        self.set_arcs(state["arcs"], merged={})
 
 
 # ------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
@@ -804,12 +821,14 @@ class Graph:
 
 class RND(nn.Module):
     """Random network distillation (Burda et al. 2019): a predictor learns the output of a fixed
-    random target network; its error is large on states unlike those it was trained on."""
+    random target network; its error is large on states unlike those it was trained on.
 
-    def __init__(self, config, shape, device="cpu"):
+    shape: of a frame, (H, W) or (H, W, C)."""
+
+    def __init__(self, config: Config, shape: tuple[int, ...], device: str = "cpu"):
         super().__init__()
         d = config.embedding
-        layers = SMALL if config.small_networks else NATURE
+        layers = SMALL_LAYERS if config.small_networks else BURDA_LAYERS
         self.batch_size = config.rnd_batch
         self.device = device
         self.target = conv_encoder(layers, shape, d, batch_norm=False)
@@ -823,12 +842,14 @@ class RND(nn.Module):
         initialise(self, config.seed, 1)
         self.target.requires_grad_(False)
         self.to(device)
-        self.optimiser = torch.optim.Adam(self.predictor.parameters(), lr=config.learning_rate)
+        self.optimiser = torch.optim.Adam(
+            self.predictor.parameters(), lr=config.learning_rate, fused=True
+        )
         self.pixels = RunningMeanStd(shape=shape)  # over all states trained on
-        self.recent_errors = deque(maxlen=5)  # one entry an iteration (R4); empty: untrained
+        self.recent_errors = deque(maxlen=5)  # one entry per iteration (R4); empty: untrained
 
     def forward(self, frames):
-        """Frames (B, H, W) -> the predictor's mean squared errors (B,), on observations
+        """Frames (B, H, W) -> mean squared errors of the predictor (B,), on observations
         standardised and clipped to +-5 (R4)."""
         z = (frames - self.pixels.mean) / np.sqrt(self.pixels.var + 1e-8)
         z = z.clip(-5, 5).astype(np.float32)
@@ -841,18 +862,17 @@ class RND(nn.Module):
         return np.concatenate([self(part).cpu().numpy() for part in in_parts(frames)])
 
     def reward(self, frames):
-        """The intrinsic reward, frames (T, H, W) -> (T,): by how many standard deviations of the
-        latest iterations' errors an error exceeds their mean (R4). It changes nothing. Before the
-        first training nothing is novel (R6)."""
+        """The intrinsic reward, frames (T, H, W) -> (T,): (error - mean) / standard deviation, over
+        the errors of the last five iterations' states, computed after training on them (R4). Before
+        the first training, nothing is novel (R6)."""
         if not self.recent_errors:
             return np.full(len(frames), -np.inf)
         recent = np.concatenate(self.recent_errors)
         return (self.errors(frames) - recent.mean()) / (recent.std() + 1e-8)
 
     def fit(self, trajectories, rng):
-        """One pass over the frames of trajectories, (T, H, W) each; before it the pixels' mean and
-        variance are updated. The errors after it scale the next iterations' rewards (R4). Returns
-        the mean loss."""
+        """Update the statistics of the pixels, then train the predictor in one pass over the frames
+        of the trajectories, (T, H, W) each. Returns the mean loss."""
         for frames in trajectories:
             self.pixels.update(frames)
         states = [frame for frames in trajectories for frame in frames]
@@ -860,19 +880,19 @@ class RND(nn.Module):
         order = rng.permutation(len(states))
         for batch in progress(batches(order, self.batch_size), "train RND"):
             losses.append(self.update(np.stack([states[k] for k in batch])))
-        # Taken after the learning: before it, the large errors of one new room would widen the
-        # scale and hide the next new room.
+        # After the training: before it, the large errors of one new room would widen the scale and
+        # hide the next new room (R4).
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
 
     def update(self, frames):
-        """One step of the predictor on frames (B, H, W). Returns the mean error before it."""
+        """One optimiser step on frames (B, H, W). Returns the mean error before it."""
         loss = self(frames).mean()
         gradient_step(self.optimiser, loss, "RND")
         return loss.item()
 
     def get_extra_state(self):
-        """What PyTorch's state_dict() keeps beside the weights."""
+        """What PyTorch's state_dict() stores beside the weights."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "pixels": statistics_state(self.pixels),
@@ -884,6 +904,51 @@ class RND(nn.Module):
         load_statistics(self.pixels, state["pixels"])
         self.recent_errors.clear()
         self.recent_errors.extend(errors.numpy() for errors in state["recent_errors"])
+
+
+# ------------------------------------------ steps and coverage (5; S5-03, S5-04, S6.2-04; R2, R25)
+
+
+class Coverage:
+    """The number of steps taken, and the units of coverage visited. All methods count here.
+
+    full: units of full coverage, None if unknown. budget: the steps of the run."""
+
+    def __init__(self, full: int | None, budget: int):
+        self.full = full
+        self.budget = budget
+        self.steps = 0
+        self.first_visits: dict[tuple, int] = {}  # unit -> step of its first visit
+
+    def count(self, unit, covers=True):
+        """Count one step, after which the agent is in `unit`; covers: whether to mark it."""
+        self.steps += 1
+        if covers:
+            self.visit(unit)
+
+    def visit(self, unit):
+        """Mark a unit as visited; None is no unit."""
+        if unit is not None:
+            self.first_visits.setdefault(unit, self.steps)
+
+    def visited(self) -> dict[tuple, int]:
+        """unit -> step of its first visit. The last iteration is always complete, but what it
+        visits after the last step of the budget does not count (S6.2-04)."""
+        return {unit: step for unit, step in self.first_visits.items() if step <= self.budget}
+
+    def metrics(self):
+        """Steps, visited units, and %Cov as a share; None where full coverage is unknown."""
+        units = len(self.visited())
+        # At most 1, because the number of units of full coverage may be an estimate (S5-03).
+        share = min(1.0, units / self.full) if self.full else None
+        return {"steps": self.steps, "units": units, "coverage": share}
+
+    def state_dict(self):
+        return {"steps": self.steps, "first_visits": dict(self.first_visits)}
+
+    def load_state_dict(self, state):
+        self.steps = state["steps"]
+        self.first_visits = dict(state["first_visits"])
 
 
 # -------------------------------------------------------- the networks' layers (6.1, R18; S6.1-03)
@@ -908,8 +973,8 @@ class BasicBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """17 convolutions, shortcuts not counted, and a linear layer (He et al. 2016): (B, C, H, W) ->
-    (B, out)."""
+    """17 convolutions, not counting the shortcuts, and a linear layer (He et al. 2016):
+    (B, C, H, W) -> (B, out)."""
 
     def __init__(self, channels, out):
         super().__init__()
@@ -930,46 +995,46 @@ class ResNet18(nn.Module):
 
     def forward(self, x):
         x = self.layers(x)  # (B, 512, h, w)
-        # As AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA.
+        # Equal to AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA.
         return self.linear(x.mean((2, 3)))
 
 
 def conv_norm(inputs, width, kernel, stride, padding):
-    """A convolution and its batch normalisation, which has the bias."""
+    """A convolution without a bias, and batch normalisation, which has one."""
     conv = nn.Conv2d(inputs, width, kernel, stride, padding, bias=False)
     return [conv, nn.BatchNorm2d(width)]
 
 
-# Width, kernel, stride, padding: of Burda et al., and the maze's.
-NATURE = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))
-SMALL = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))
+# Width, kernel, stride and padding of each convolution.
+BURDA_LAYERS = ((32, 8, 4, 0), (64, 4, 2, 0), (64, 3, 1, 0))
+SMALL_LAYERS = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))
 
 
 def conv_encoder(layers, shape, out, batch_norm):
-    """A stack of convolutions and a linear layer, for frames of a shape: (B, C, H, W) -> (B,
-    out)."""
+    """Convolutions and a linear layer for frames of this shape: (B, C, H, W) -> (B, out)."""
     modules = []
     channels = channels_of(shape)
     for width, kernel, stride, padding in layers:
-        modules.append(nn.Conv2d(channels, width, kernel, stride, padding))
         if batch_norm:
-            modules.append(nn.BatchNorm2d(width))
+            modules += conv_norm(channels, width, kernel, stride, padding)
+        else:
+            modules.append(nn.Conv2d(channels, width, kernel, stride, padding))
         modules.append(nn.ReLU(inplace=True))
         channels = width
     modules.append(nn.Flatten())
     example = torch.zeros(1, channels_of(shape), *shape[:2])
     try:
-        features = nn.Sequential(*modules).eval()(example)  # batch normalisation learns nothing
+        features = nn.Sequential(*modules).eval()(example)  # in evaluation mode nothing is learned
     except RuntimeError:
         raise InputError(
-            f"frames of {shape[0]} x {shape[1]} pixels are too small for the network: "
-            "make them larger, or set small_networks"
+            f"frames of {shape[0]} x {shape[1]} pixels are too small for the network: make them "
+            "larger"
         ) from None
     return nn.Sequential(*modules, nn.Linear(features.shape[1], out))
 
 
 def dense(inputs, outputs):
-    """A layer of R's head (R20)."""
+    """A layer of R's head: batch normalisation and ReLU before the linear layer (R20)."""
     return [nn.BatchNorm1d(inputs), nn.ReLU(), nn.Linear(inputs, outputs)]
 
 
@@ -978,7 +1043,7 @@ def channels_of(shape):
 
 
 def initialise(network, seed, number):
-    """He's initialisation, and biases of 0. The number tells the networks of one seed apart."""
+    """He's initialisation, and zero biases. `number` distinguishes the networks of one seed."""
     generator = torch.Generator()
     generator.manual_seed(np.random.SeedSequence([seed, number]).generate_state(1).item())
     for layer in network.modules():
@@ -1002,7 +1067,7 @@ def channels_first(x):
 
 
 def in_parts(frames, size=512):
-    """Frames in parts that fit into memory at once."""
+    """Frames in parts of at most `size`, to bound the memory that the networks need."""
     return [frames[k : k + size] for k in range(0, len(frames), size)]
 
 
@@ -1013,42 +1078,23 @@ def batches(items, size):
 
 
 def gradient_step(optimiser, loss, name, max_norm=math.inf):
-    """One step down the loss, its gradient at most max_norm long. Raises InputError if the loss is
-    infinite or no number."""
+    """One optimiser step, with the norm of the gradient clipped to max_norm. Raises InputError if
+    the loss is infinite or not a number."""
     if not math.isfinite(loss.item()):
-        raise InputError(f"the loss of {name} is {loss.item()}: give a lower learning rate")
+        raise InputError(f"the loss of {name} is {loss.item()}: choose a lower learning_rate")
     optimiser.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], max_norm)
     optimiser.step()
 
 
-def check_budget(algorithm):
-    budget = algorithm.config.steps
-    if algorithm.steps >= budget:
-        raise InputError(f"the budget of {budget:,} steps is spent: give more steps")
-
-
-def full_coverage(env):
-    """The number of units of full coverage; None where it is unknown."""
-    return getattr(env, "full_coverage", None)
-
-
-def progress_metrics(algorithm):
-    """Where a run stands, and %Cov: visited units of all, where these are known (5; S5-03)."""
-    full = full_coverage(algorithm.env)
-    units = len(algorithm.discovered)
-    return {
-        "iteration": algorithm.iteration,
-        "phase": "pretrain" if algorithm.pretraining else "explore",
-        "steps": algorithm.steps,
-        "units": units,
-        "coverage": min(1.0, units / full) if full else None,  # a full count may be an estimate
-    }
+def share_above(threshold, parts):
+    """The share of all values in these arrays above a threshold; None if there are none."""
+    return float(np.mean(np.concatenate(parts) > threshold)) if parts else None
 
 
 def statistics_state(statistics):
-    """A RunningMeanStd, for a checkpoint."""
+    """A RunningMeanStd as plain data."""
     return {
         "mean": torch.as_tensor(statistics.mean),
         "var": torch.as_tensor(statistics.var),
@@ -1063,8 +1109,15 @@ def load_statistics(statistics, state):
 
 
 def progress(items, what, total=None):
-    """A bar over a long loop; silent where the output is no terminal."""
-    return tqdm(items, desc=what, total=total, leave=False, disable=None)
+    """A progress bar over a long loop; silent where stderr is not a terminal."""
+    try:
+        from tqdm import tqdm
+    except ValueError as error:
+        raise InputError(
+            f"an environment variable TQDM_... is invalid ({error}): correct it, or unset it"
+        ) from None
+    disable = True if sys.stderr is None else None  # None: where it is not a terminal
+    return tqdm(items, desc=what, total=total, leave=False, disable=disable)
 
 
 # ##################################################################################################
@@ -1075,66 +1128,55 @@ def progress(items, what, total=None):
 
 
 class Baseline:
-    """What the compared methods share with RbExplore: one count of steps, one coverage, and the
-    interface that a run folder uses. A subclass has advance(rng): act and learn for one iteration,
-    and return metrics."""
+    """What the compared methods share: the interface of RbExplore that Run uses. A subclass
+    implements advance(rng), which acts and learns for one iteration and returns metrics."""
 
     pretraining = False
 
-    def __init__(self, env_fn, config):
+    def __init__(self, env_fn: Callable[[], PersistentEnv], config: Config):
         self.config = config
-        self.env = env_fn()
-        check_contract(self.env, config.seed)
-        self.s_init = self.reset()
-        unit = unit_key(self.env.unit())
+        self.env = make_checked(env_fn, config.seed)
+        frame = self.reset()
+        self.initial_state = State(frame, self.env.snapshot())
+        self.coverage = Coverage(getattr(self.env, "full_coverage", None), config.steps)
+        self.coverage.visit(unit_key(self.env.unit()))
         self.iteration = 0
-        self.steps = 0
-        self.discovered = {} if unit is None else {unit: 0}
 
     def iterate(self) -> Iteration:
-        """One iteration."""
-        check_budget(self)
+        """Run one iteration."""
         self.iteration += 1
         metrics = self.advance(np.random.default_rng([self.config.seed, self.iteration]))
-        return Iteration({**progress_metrics(self), **metrics})
+        progress_made = {"iteration": self.iteration, "phase": "explore", **self.coverage.metrics()}
+        return Iteration(progress_made | metrics)
 
     def reset(self):
-        """Back to the start; gives its frame."""
+        """Return to s_init. Returns its frame."""
         return np.array(self.env.reset(seed=self.config.seed)[0])
 
     def step(self, action):
-        """One step, counted and covered as RbExplore's. Returns the frame, and whether the episode
-        has ended."""
+        """One step. Returns the frame, and whether the episode has ended."""
         action += int(self.env.action_space.start)
         frame, _, terminated, truncated, _ = self.env.step(action)
-        self.steps += 1
-        unit = unit_key(self.env.unit())
-        if unit is not None:
-            self.discovered.setdefault(unit, self.steps)
+        self.coverage.count(unit_key(self.env.unit()))
         return np.array(frame), bool(terminated or truncated)
 
     def state_dict(self):
-        return {
-            "iteration": self.iteration,
-            "steps": self.steps,
-            "discovered": dict(self.discovered),
-        }
+        return {"iteration": self.iteration, "coverage": self.coverage.state_dict()}
 
     def load_state_dict(self, state):
         self.iteration = state["iteration"]
-        self.steps = state["steps"]
-        self.discovered = dict(state["discovered"])
+        self.coverage.load_state_dict(state["coverage"])
 
 
 class Random(Baseline):
-    """Uniform over the actions, always from the start, M episodes an iteration: nothing is
-    stored."""
+    """Uniform actions, M episodes per iteration, each from s_init."""
+
+    method = "random"
 
     def advance(self, rng):
         for _ in range(self.config.M):
             self.reset()
-            length = min(self.config.trajectory_steps, self.config.steps - self.steps)
-            for _ in range(length):
+            for _ in range(self.config.trajectory_steps):
                 _, ended = self.step(int(rng.integers(self.env.action_space.n)))
                 if ended:
                     break
@@ -1142,30 +1184,32 @@ class Random(Baseline):
 
 
 class RNDBonus(RND):
-    """The bonus of Burda et al. 2019: the error of RND on the state arrived at. R4's scale is not
-    used."""
+    """The bonus of Burda et al. 2019: the error of RND on the successor, without the scale of
+    R4."""
 
     def bonus(self, before, actions, after):
-        """Frames (T, H, W), actions (T,), frames (T, H, W) -> (T,). The statistics of the pixels
-        come first, as there is no error without them."""
+        """Frames (T, H, W), actions (T,), successors (T, H, W) -> bonus (T,). Updates the
+        statistics of the pixels first."""
         self.pixels.update(after)
         return self.errors(after)
 
     def learn(self, before, actions, after):
-        """One step on a batch. Returns the losses by name."""
+        """One optimiser step on a batch. Returns the losses by name."""
         return {"rnd_loss": self.update(after)}
 
 
 class ICM(nn.Module):
-    """The bonus of Pathak et al. 2017: the error of a forward model, in the features of an encoder
-    that learns by the inverse model alone. Its layers are RND's."""
+    """The intrinsic curiosity module (Pathak et al. 2017): the bonus is the error of a forward
+    model, in the features of an encoder that only the inverse model trains. Its layers are RND's.
 
-    BETA = 0.2  # the weight of the forward loss (Pathak)
+    actions: the number of actions."""
 
-    def __init__(self, config, shape, actions, device):
+    BETA = 0.2  # weight of the forward loss (Pathak et al.)
+
+    def __init__(self, config: Config, shape: tuple[int, ...], actions: int, device: str = "cpu"):
         super().__init__()
         d = config.embedding
-        layers = SMALL if config.small_networks else NATURE
+        layers = SMALL_LAYERS if config.small_networks else BURDA_LAYERS
         self.actions = actions
         self.device = device
         self.encoder = conv_encoder(layers, shape, d, batch_norm=False)
@@ -1176,27 +1220,28 @@ class ICM(nn.Module):
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate)
 
     def losses(self, before, actions, after):
-        """Frames (B, H, W), actions (B,), frames (B, H, W) -> inverse and forward losses, (B,)
-        each: their equations 3 and 5."""
+        """Frames (B, H, W), actions (B,), successors (B, H, W) -> inverse and forward losses, (B,)
+        each: equations 3 and 5 of Pathak et al."""
         frames = to_input(np.concatenate([before, after]), self.device)
         phi, phi_next = self.encoder(frames).chunk(2)  # (B, d) each
         a = torch.from_numpy(actions).to(self.device)
-        a_guess = self.inverse_model(torch.cat([phi, phi_next], dim=1))
-        inverse = F.cross_entropy(a_guess, a, reduction="none")
+        logits = self.inverse_model(torch.cat([phi, phi_next], dim=1))  # (B, actions)
+        inverse = F.cross_entropy(logits, a, reduction="none")
         one_hot = F.one_hot(a, self.actions)
-        phi_guess = self.forward_model(torch.cat([phi.detach(), one_hot], dim=1))
-        forward = (phi_guess - phi_next.detach()).square().sum(1) / 2
+        predicted = self.forward_model(torch.cat([phi.detach(), one_hot], dim=1))  # (B, d)
+        forward = (predicted - phi_next.detach()).square().sum(1) / 2
         return inverse, forward
 
     @torch.no_grad()
     def bonus(self, before, actions, after):
-        """Their equation 6, (T,), without its factor eta: PPO divides by the bonus's own scale."""
+        """Equation 6 of Pathak et al., (T,), without the factor eta, because PPO divides by the
+        scale of the bonus."""
         parts = zip(in_parts(before), in_parts(actions), in_parts(after), strict=True)
         return np.concatenate([self.losses(*part)[1].cpu().numpy() for part in parts])
 
     def learn(self, before, actions, after):
-        """One step on their equation 7, whose policy term is PPO's own. Returns the losses by
-        name."""
+        """One optimiser step on equation 7 of Pathak et al., without the policy's term. Returns the
+        losses by name."""
         inverse, forward = self.losses(before, actions, after)
         loss = (1 - self.BETA) * inverse.mean() + self.BETA * forward.mean()
         gradient_step(self.optimiser, loss, "ICM")
@@ -1214,11 +1259,11 @@ def perceptron(inputs, width, outputs):
 
 
 def advantages_of(rewards, values, last_value, gamma, gae_lambda):
-    """Generalised advantage estimation (Schulman et al. 2016, equation 16): (T,) from rewards (T,),
-    values (T,) of the states acted in, and the value of the state after. Returns go on beyond the
-    end of an episode, as intrinsic ones do (Burda)."""
-    following = np.append(values[1:], last_value)
-    delta = rewards + gamma * following - values
+    """Generalised advantage estimation (Schulman et al. 2016, equation 16): rewards (T,), values
+    (T,) of the states acted in, and the value of the last successor -> advantages (T,). Returns
+    continue beyond the end of an episode, because the intrinsic reward does (Burda et al.)."""
+    next_values = np.append(values[1:], last_value)
+    delta = rewards + gamma * next_values - values
     advantages = np.zeros(len(rewards))
     advantage = 0.0
     for t in reversed(range(len(rewards))):
@@ -1227,26 +1272,48 @@ def advantages_of(rewards, values, last_value, gamma, gae_lambda):
     return advantages
 
 
+@dataclass
+class Rollout:
+    """T steps of an agent."""
+
+    before: np.ndarray  # frames (T, H, W)
+    actions: np.ndarray  # (T,)
+    after: np.ndarray  # successors (T, H, W)
+    log_p: np.ndarray  # log-probabilities of the actions (T,)
+    values: np.ndarray  # of the states before (T,)
+    last_value: float  # of the state after the last step
+
+
 class PPO(Baseline):
-    """Proximal policy optimisation (Schulman et al. 2017) of a bonus alone, RND's or ICM's, by the
-    settings of Burda et al. 2019, table 5 (R27), but for one actor, whose rollout is by default as
-    long as that of their 128, and a policy that sees what RbExplore sees: one frame (5)."""
+    """Proximal policy optimisation (Schulman et al. 2017) of a bonus only, RND's or ICM's, with the
+    settings of Burda et al. 2019, table 5 (R27), except that one actor makes a rollout that is by
+    default as long as those of their 128 together, and that the policy sees what RbExplore sees:
+    one frame (5).
+
+    method: rnd or icm."""
 
     GAMMA = 0.99  # discount of the intrinsic reward
     GAE_LAMBDA = 0.95
-    PASSES = 4  # over a rollout
-    MINIBATCHES = 4  # a pass
-    CLIP = 0.1  # bound on the change of a probability
+    EPOCHS = 4  # over a rollout
+    MINIBATCHES = 4  # per epoch
+    CLIP = 0.1  # of the probability ratio
     ENTROPY = 0.001  # weight of the entropy
-    VALUE = 0.5  # weight of the value's squared error (Burda's code)
+    VALUE = 0.5  # weight of the value loss (Burda et al.'s code)
 
-    def __init__(self, env_fn, config, method, device):
+    def __init__(
+        self,
+        env_fn: Callable[[], PersistentEnv],
+        config: Config,
+        method: str,
+        device: str = "cpu",
+    ):
         super().__init__(env_fn, config)
+        self.method = method
         self.device = device
         self.actions = int(self.env.action_space.n)
-        shape = self.s_init.shape
+        shape = self.initial_state.frame.shape
         width = config.head_width
-        layers = SMALL if config.small_networks else NATURE
+        layers = SMALL_LAYERS if config.small_networks else BURDA_LAYERS
         with torch.random.fork_rng(devices=[]):
             encoder = conv_encoder(layers, shape, width, batch_norm=False)
             head = nn.Linear(width, self.actions + 1)  # the logits of the policy, and the value
@@ -1256,13 +1323,13 @@ class PPO(Baseline):
             else:
                 self.curiosity = ICM(config, shape, self.actions, device)
         initialise(self.network, config.seed, 3)
-        head.weight.data *= 0.01  # so that the first policy is uniform and the first values are 0
+        head.weight.data *= 0.01  # so that the first policy is nearly uniform
         self.network.to(device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.discounted_sum = 0.0  # of the bonus so far
         self.discounted_sums = RunningMeanStd()
-        self.frame = self.s_init
-        self.age = 0  # steps of this episode
+        self.state = self.initial_state  # where the next rollout starts
+        self.age = 0  # steps of the current episode
 
     def policy(self, frames):
         """Frames (B, H, W) -> log-probabilities (B, actions), values (B,)."""
@@ -1271,51 +1338,58 @@ class PPO(Baseline):
 
     @torch.no_grad()
     def act(self, frame, rng):
-        """A sample of the policy: the action, its log-probability, and the value of the state."""
+        """Sample the policy. Returns the action, its log-probability, and the value of the
+        state."""
         log_p, value = self.policy(frame[None])
         log_p = log_p[0].cpu().numpy()
         action = int(np.argmax(log_p + rng.gumbel(size=self.actions)))
         return action, log_p[action], value.item()
 
     def advance(self, rng):
-        """A rollout, and several passes over it, of PPO and of the bonus."""
-        before, actions, after, log_p, values, last_value = self.rollout(rng)
-        bonus = self.curiosity.bonus(before, actions, after)
+        """Make a rollout, and train the policy and the curiosity module on it."""
+        r = self.rollout(rng)
+        bonus = self.curiosity.bonus(r.before, r.actions, r.after)
         rewards = self.scaled(bonus)
-        advantages = advantages_of(rewards, values, last_value, self.GAMMA, self.GAE_LAMBDA)
-        returns = advantages + values
-        size = math.ceil(len(actions) / self.MINIBATCHES)
+        advantages = advantages_of(rewards, r.values, r.last_value, self.GAMMA, self.GAE_LAMBDA)
+        returns = advantages + r.values
+        size = math.ceil(len(bonus) / self.MINIBATCHES)
         losses = []
-        for _ in range(self.PASSES):
-            for k in batches(rng.permutation(len(actions)), size):
-                ppo = self.update(before[k], actions[k], log_p[k], advantages[k], returns[k])
-                losses.append(ppo | self.curiosity.learn(before[k], actions[k], after[k]))
+        for _ in range(self.EPOCHS):
+            for k in batches(rng.permutation(len(bonus)), size):
+                ppo_losses = self.update(
+                    r.before[k], r.actions[k], r.log_p[k], advantages[k], returns[k]
+                )
+                bonus_losses = self.curiosity.learn(r.before[k], r.actions[k], r.after[k])
+                losses.append(ppo_losses | bonus_losses)
         means = {name: float(np.mean([row[name] for row in losses])) for name in losses[0]}
         return {"bonus": float(bonus.mean()), **means}
 
     def rollout(self, rng):
-        """Frames (T, H, W), actions (T,), frames arrived at (T, H, W), log-probabilities (T,),
-        values (T,), and the value of the state after. T ends with the budget (S6.2-04)."""
-        T = min(self.config.rollout_steps, self.config.steps - self.steps)
-        before = np.empty((T, *self.frame.shape), np.uint8)
+        """Act for `rollout_steps` steps from where the last rollout ended."""
+        roll_back(self.env, self.state)
+        frame = self.state.frame
+        T = self.config.rollout_steps
+        before = np.empty((T, *frame.shape), np.uint8)
         after = np.empty_like(before)
         actions = np.empty(T, np.int64)
         log_p = np.empty(T, np.float32)
         values = np.empty(T, np.float32)
         for t in progress(range(T), "rollout"):
-            before[t] = self.frame
-            actions[t], log_p[t], values[t] = self.act(self.frame, rng)
-            self.frame, ended = self.step(int(actions[t]))
-            after[t] = self.frame
+            before[t] = frame
+            actions[t], log_p[t], values[t] = self.act(frame, rng)
+            frame, ended = self.step(int(actions[t]))
+            after[t] = frame
             self.age += 1
             if ended or self.age >= self.config.episode_steps:
-                self.frame = self.reset()
+                frame = self.reset()
                 self.age = 0
-        _, _, last_value = self.act(self.frame, rng)
-        return before, actions, after, log_p, values, last_value
+        self.state = State(frame, self.env.snapshot())
+        _, _, last_value = self.act(frame, rng)
+        return Rollout(before, actions, after, log_p, values, last_value)
 
     def scaled(self, bonus):
-        """The bonus (T,) over the standard deviation of its discounted sums so far (Burda, 2.4)."""
+        """The bonus (T,) divided by the standard deviation of its discounted sums so far (Burda et
+        al., 2.4)."""
         sums = np.empty(len(bonus))
         for t in range(len(bonus)):
             self.discounted_sum = self.GAMMA * self.discounted_sum + float(bonus[t])
@@ -1324,7 +1398,7 @@ class PPO(Baseline):
         return bonus / np.sqrt(self.discounted_sums.var + 1e-8)
 
     def update(self, frames, actions, old_log_p, advantages, returns):
-        """One step on B states: the clipped objective, the value's squared error and the entropy
+        """One optimiser step on B states: the clipped objective, the value loss and the entropy
         (Schulman et al. 2017, equations 7 and 9). Returns the losses by name."""
         log_p, values = self.policy(frames)
         old_log_p = torch.from_numpy(old_log_p).to(values)  # (B,)
@@ -1332,10 +1406,10 @@ class PPO(Baseline):
         returns = torch.from_numpy(returns).to(values)
         ratio = (log_p[range(len(actions)), actions] - old_log_p).exp()
         clipped = ratio.clamp(1 - self.CLIP, 1 + self.CLIP)
-        gain = torch.min(ratio * advantages, clipped * advantages).mean()
+        objective = torch.min(ratio * advantages, clipped * advantages).mean()
         value_loss = (values - returns).square().mean()
         entropy = -(log_p.exp() * log_p).sum(1).mean()
-        loss = self.VALUE * value_loss - gain - self.ENTROPY * entropy
+        loss = self.VALUE * value_loss - objective - self.ENTROPY * entropy
         gradient_step(self.optimiser, loss, "PPO")
         return {"value_loss": value_loss.item(), "entropy": entropy.item()}
 
@@ -1347,8 +1421,8 @@ class PPO(Baseline):
             "curiosity": self.curiosity.state_dict(),
             "discounted_sum": self.discounted_sum,
             "discounted_sums": statistics_state(self.discounted_sums),
-            "frame": torch.from_numpy(self.frame),
-            "snapshot": self.env.snapshot(),
+            "frame": torch.from_numpy(self.state.frame),
+            "snapshot": self.state.snapshot,
             "age": self.age,
         }
 
@@ -1359,14 +1433,13 @@ class PPO(Baseline):
         self.curiosity.load_state_dict(state["curiosity"])
         self.discounted_sum = state["discounted_sum"]
         load_statistics(self.discounted_sums, state["discounted_sums"])
-        self.frame = state["frame"].numpy()
-        roll_back(self.env, State(self.frame, state["snapshot"]))
+        self.state = State(state["frame"].numpy(), state["snapshot"])
         self.age = state["age"]
 
 
 class Cells(nn.Module):
-    """Go-Explore's cells without domain knowledge (Ecoffet et al. 2019) in the place of R: two
-    frames are similar if they are equal in 11 x 8 pixels of 8 grey levels. Nothing is learned."""
+    """Go-Explore's cells without domain knowledge (Ecoffet et al. 2019) in place of R: two frames
+    are similar if they are equal in 11 x 8 pixels of 8 grey levels. Nothing is learned."""
 
     def embed(self, frames):
         """Frames (T, H, W) uint8 -> cells (T, 88)."""
@@ -1378,7 +1451,7 @@ class Cells(nn.Module):
         return torch.cat(cells)
 
     def score(self, e_1, e_2):
-        """Cells (K, 88), and (K, 88) or (88,) -> (K,)."""
+        """Cells (K, 88) and others, (K, 88) or a single one (88,) -> (K,)."""
         return (e_1 == e_2).all(1).double().numpy()
 
     def rates(self, pairs, rng):
@@ -1391,15 +1464,25 @@ class Cells(nn.Module):
 METHODS = ("rbexplore", "rnd", "icm", "random", "cells")
 
 
-def make_method(method, env_fn, config, device="cpu", executor=None):
-    """RbExplore, or a method with its interface."""
+def make_method(
+    method: str,
+    env_fn: Callable[[], PersistentEnv],
+    config: Config,
+    device: str = "cpu",
+    executor: Executor | None = None,
+):
+    """RbExplore, or another method with its interface. The others do not train R, so they skip
+    pretraining and additional trajectories."""
+    if method == "rbexplore":
+        return RbExplore(env_fn, config, device, executor)
+    config = replace(config, pretrain_steps=0, L=0)
     if method == "random":
         return Random(env_fn, config)
     if method in ("rnd", "icm"):
         return PPO(env_fn, config, method, device)
     algorithm = RbExplore(env_fn, config, device, executor)
-    if method == "cells":
-        algorithm.similarity = Cells()
+    algorithm.method = "cells"
+    algorithm.similarity = Cells()
     return algorithm
 
 
@@ -1407,208 +1490,169 @@ def make_method(method, env_fn, config, device="cpu", executor=None):
 
 
 class Run:
-    """A run folder: config.json, metrics.csv, checkpoint.pt, trace.jsonl and the figures; and what
-    one sees meanwhile. It has one owner: InputError where another process works in it.
+    """A run in a folder. Iterating over it runs the algorithm until its steps are spent, and yields
+    each Iteration after it was saved:
 
-    settings: what makes the run, for config.json; by default the configuration alone."""
+        with Run("runs/mine", explorer).begin() as run:  # or resume()
+            for iteration in run:
+                print(iteration.metrics)
 
-    def __init__(self, folder, algorithm, settings=None, trace=False):
-        self.folder = pathlib.Path(folder)
+    A run is resumed from checkpoint.pt alone; config.json and metrics.csv are for people. While it
+    works, and inside `with`, it holds the folder's lock. Whatever interrupts an iteration, the
+    algorithm is back at the last complete one before the exception leaves the run.
+
+    settings: plain data to record beside the method and its configuration.
+    stop_at_full: stop at full coverage.
+
+    Raises InputError where another process works in the folder."""
+
+    def __init__(
+        self,
+        folder: str | os.PathLike,
+        algorithm,
+        settings: dict | None = None,
+        stop_at_full: bool = False,
+    ):
+        self.folder = pathlib.Path(os.path.expanduser(folder))
         self.algorithm = algorithm
-        self.settings = settings or {"config": asdict(algorithm.config)}
-        self.trace = trace
-        self.rows = []
-        self.trace_bytes = 0
+        self.settings = {
+            "method": algorithm.method,
+            "config": asdict(algorithm.config),
+            "frame_shape": list(algorithm.initial_state.frame.shape),
+            "full_coverage": algorithm.coverage.full,
+            "unit_name": getattr(algorithm.env, "unit_name", "units"),
+            **(settings or {}),
+        }
+        self.stop_at_full = stop_at_full
+        self.rows: list[dict] = []  # the metrics of each iteration
+        self.ended_at_once = 0  # trajectories in a row that ended at their first step
         self.lock = filelock.FileLock(self.folder / ".lock", timeout=0)
 
-    def begin(self):
-        """Begin in a folder that is new or empty. Returns the run."""
-        check_unused(self.folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.own()
-        check_unused(self.folder)  # again, now that nobody else can begin in it
-        self.write_settings()
-        if self.trace:
-            (self.folder / "trace.jsonl").touch()
-        self.save()
-        return self
-
-    def resume(self):
-        """Go on from the last complete iteration; what came after it is forgotten. Returns the
-        run."""
-        self.own()
-        saved = [self.folder / "checkpoint.pt", self.folder / "metrics.csv"]
-        if any(path.exists() for path in saved):  # else it was stopped as soon as it had begun
-            self.load()
-        trace = self.folder / "trace.jsonl"
-        size = trace.stat().st_size if trace.exists() else 0
-        if size < self.trace_bytes:
-            raise InputError(
-                f"{trace} is missing or cut short: put the whole file back, or begin "
-                "anew with another --out"
-            )
-        if trace.exists():
-            self.trace = True
-            os.truncate(trace, self.trace_bytes)
-        self.write_settings()
-        self.save()
-        return self
-
-    def own(self):
+    def __enter__(self) -> "Run":
+        """Hold the lock; a run may hold it more than once."""
         try:
             self.lock.acquire()
         except filelock.Timeout:
             raise InputError(
-                f"{self.folder} is in use by another process: wait for its end, or "
-                "choose another --out"
+                f"{self.folder} is in use by another process: wait for its end, or choose another "
+                f"folder. If no process uses it, delete {self.folder / '.lock'}"
             ) from None
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.lock.release()
+
+    def begin(self) -> "Run":
+        """Begin in a folder that is new or empty. Returns the run."""
+        check_unused(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with self:
+            check_unused(self.folder)  # again, now that no other process can begin in it
+            self.save()
+        return self
+
+    def resume(self) -> "Run":
+        """Continue after the last complete iteration. Returns the run."""
+        read_checkpoint(self.folder)  # so that nothing is created where there is no run
+        with self:
+            self.load()
+            self.save()
+        return self
+
+    def __iter__(self) -> Iterator[Iteration]:
+        with self:
+            while not self.is_done():
+                began = time.monotonic()
+                try:
+                    iteration = self.algorithm.iterate()
+                    seconds = round(time.monotonic() - began, 2)
+                    self.rows.append({**iteration.metrics, "seconds": seconds})
+                    self.save()
+                except BaseException:
+                    self.load()
+                    raise
+                self.check_ends(iteration.trajectories)
+                yield iteration
+
+    def is_done(self) -> bool:
+        """Whether the steps are spent, or full coverage is reached where that is to be the end."""
+        coverage = self.algorithm.coverage
+        if self.stop_at_full and coverage.full and len(coverage.visited()) >= coverage.full:
+            return True
+        return coverage.steps >= coverage.budget
+
+    def check_ends(self, trajectories):
+        """Warn if ten trajectories in a row end at their first step, as they do from new clusters
+        that nobody survives. Raise InputError if even the walks from s_init are truncated there,
+        because then restore() does not reset a time limit."""
+        for tau in trajectories:
+            at_once = len(tau.units) == 1 and (tau.terminated or tau.truncated)
+            self.ended_at_once = self.ended_at_once + 1 if at_once else 0
+            if self.ended_at_once == 10:
+                warnings.warn("ten trajectories in a row ended at their first step", stacklevel=3)
+                s_init = self.algorithm.initial_state
+                walks = self.algorithm.walks([s_init] * 100, list(range(100)), 1)
+                if all(walk_from_s_init.truncated for walk_from_s_init in walks):
+                    raise InputError(
+                        "every trajectory from s_init is truncated at its first step: the "
+                        "environment has a time limit that restore() does not reset; remove it"
+                    )
+
+    def save(self):
+        state = {
+            "settings": self.settings,
+            "rows": self.rows,
+            "s_init": torch.from_numpy(self.algorithm.initial_state.frame),
+            "algorithm": self.algorithm.state_dict(),
+        }
+        content = io.BytesIO()  # not the file, because torch reports a full disk in its own way
+        torch.save(state, content)
+        write_atomically(self.folder / "checkpoint.pt", content.getvalue())
+        for_people = {
+            "config.json": json.dumps(self.settings, indent=1),
+            "metrics.csv": csv_text(self.rows),
+        }
+        for name, text in for_people.items():
+            try:
+                write_atomically(self.folder / name, text.encode())
+            except OSError as error:  # the run does not need it; the next iteration tries again
+                problem = error.strerror or error
+                warnings.warn(f"{self.folder / name} cannot be written: {problem}", stacklevel=3)
 
     def load(self):
-        """Take the state of the last complete iteration from the checkpoint; writes nothing."""
+        """Restore the state of the last complete iteration. Raises InputError for a run of another
+        method, configuration or environment."""
         state = read_checkpoint(self.folder)
-        if state["settings"] != fixed(self.settings):
+        saved = {"method": state["settings"]["method"], **state["settings"]["config"]}
+        mine = {"method": self.settings["method"], **self.settings["config"]}
+        for name, value in mine.items():
+            if name != "steps" and saved.get(name) != value:
+                raise InputError(
+                    f"{self.folder} holds another run: {name} is {saved.get(name)} there and "
+                    f"{value} here"
+                )
+        if not np.array_equal(state["s_init"].numpy(), self.algorithm.initial_state.frame):
             raise InputError(
-                f"{self.folder / 'checkpoint.pt'} is of another configuration than "
-                "config.json beside it: put the right one back"
+                f"{self.folder} holds a run of another environment: its initial state differs"
             )
         try:
             self.algorithm.load_state_dict(state["algorithm"])
         except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             raise damaged(self.folder, error) from None
         self.rows = state["rows"]
-        self.trace_bytes = state["trace_bytes"]
-
-    def go(self, stop_at_full=False):
-        """Iterate until the budget is spent, or all is covered if that is to be the end. Returns
-        False after Ctrl-C, which goes back to the last complete iteration."""
-        print(self.header())
-        try:
-            while not self.is_done(stop_at_full):
-                began = time.monotonic()
-                iteration = self.algorithm.iterate()
-                self.keep(iteration, time.monotonic() - began)
-                print(self.line(), flush=True)
-        except KeyboardInterrupt:
-            print("\nstopped: going back to the last complete iteration", flush=True)
-            self.load()
-            return False
-        return True
-
-    def is_done(self, stop_at_full):
-        a = self.algorithm
-        is_full = len(a.discovered) >= (full_coverage(a.env) or math.inf)
-        return a.steps >= a.config.steps or (stop_at_full and is_full)
-
-    def keep(self, iteration, seconds):
-        """Keep what an iteration did: its row, its trace, the state after it."""
-        row = dict(iteration.metrics)
-        row["memory_mb"] = round(megabytes(self.algorithm, iteration), 3)
-        row["seconds"] = round(seconds, 2)
-        self.rows.append(row)
-        if self.trace:
-            with open(self.folder / "trace.jsonl", "ab") as file:
-                file.write(json.dumps(trace_of(iteration)).encode() + b"\n")
-                self.trace_bytes = file.tell()
-        self.save()
-
-    def save(self):
-        state = {
-            "settings": fixed(self.settings),
-            "rows": self.rows,
-            "trace_bytes": self.trace_bytes,
-            "algorithm": self.algorithm.state_dict(),
-        }
-        content = io.BytesIO()  # not to the file: torch has an error of its own for a full disk
-        torch.save(state, content)
-        write_atomically(self.folder / "checkpoint.pt", content.getvalue())
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        lines = [names] + [[as_cell(row.get(name)) for name in names] for row in self.rows]
-        text = "".join(",".join(line) + "\n" for line in lines)
-        write_atomically(self.folder / "metrics.csv", text.encode())
-
-    def write_settings(self):
-        write_atomically(self.folder / "config.json", json.dumps(self.settings, indent=1).encode())
-
-    def header(self):
-        a = self.algorithm
-        full = full_coverage(a.env)
-        target = f"{full} {unit_name(a.env)} to cover" if full else "full coverage is not known"
-        headings = " ".join(f"{heading:>{width}}" for heading, width, _, _ in COLUMNS)
-        return (
-            f"{self.settings.get('method', 'rbexplore')}: {target}; seed {a.config.seed}; "
-            f"{a.config.steps:,} steps, {a.config.pretrain_steps:,} of them pretraining; "
-            f"run folder {self.folder}\n{headings}    left"
-        )
-
-    def line(self):
-        """What is shown of the latest iteration, with a warning where R tells little."""
-        row = self.rows[-1]
-        cells = []
-        for _, width, name, form in COLUMNS:
-            value = row.get(name)
-            cell = "-" if value is None else format(value, form)
-            cells.append(f"{cell:>{width}}")
-        recent = self.rows[-5:]
-        steps_before = self.rows[-6]["steps"] if len(self.rows) > 5 else 0
-        pace = sum(r["seconds"] for r in recent) / max(1, row["steps"] - steps_before)
-        left = round(pace * (self.algorithm.config.steps - row["steps"]))
-        cells.append(f"{left // 60:4}:{left % 60:02}")
-        for name, finds in (("r_tpr", "new"), ("r_tnr", "known")):
-            rate = row.get(name)
-            if row["phase"] == "explore" and rate is not None and rate < 0.2:
-                found = f"before its training R found nearly all {finds}"
-                cells.append(f"\n       warning: {name} is {rate:.2f}: {found}")
-        return " ".join(cells)
-
-    def summary(self):
-        a = self.algorithm
-        full = full_coverage(a.env)
-        seconds = sum(row["seconds"] for row in self.rows)
-        text = f"{a.steps:,} steps, {seconds:.0f} s: {len(a.discovered)} {unit_name(a.env)}"
-        if full:
-            text += f" of {full}, {100 * progress_metrics(a)['coverage']:.1f} %; steps to "
-            marks = steps_to(a.discovered, full)
-            text += ", ".join(f"{mark} %: {step or 'not reached'}" for mark, step in marks.items())
-        return text
-
-
-COLUMNS = (  # heading, width, name in the row, format
-    ("iter", 5, "iteration", "d"),
-    ("phase", 8, "phase", "s"),
-    ("steps", 9, "steps", ",d"),
-    ("units", 6, "units", "d"),
-    ("%Cov", 6, "coverage", ".1%"),
-    ("clusters", 8, "clusters", "d"),
-    ("new", 4, "added", "d"),
-    ("merged", 6, "merged", "d"),
-    ("R's loss", 8, "r_loss", ".3f"),
-    ("TPR", 4, "r_tpr", ".2f"),
-    ("TNR", 4, "r_tnr", ".2f"),
-    ("novel", 6, "novel_share", ".1%"),
-    ("s", 5, "seconds", ".1f"),
-)
-BEGINNINGS = {".lock", "config.json.new"}  # what a run leaves that was killed before it began
 
 
 def check_unused(folder):
-    """Raise InputError for a folder that holds a run, or anything else; it is not touched."""
-    if (folder / "config.json").exists():
-        raise InputError(f"{folder} holds a run already: --resume it, or choose another --out")
-    if folder.exists() and {path.name for path in folder.iterdir()} - BEGINNINGS:
-        raise InputError(f"{folder} is not empty, and no run of ours: choose another --out")
-
-
-def fixed(settings):
-    """What makes the run, of its settings: the rest may change when it goes on."""
-    free = ("workers", "rom", "state", "device", "versions")
-    kept = {name: value for name, value in settings.items() if name not in free}
-    kept["config"] = settings["config"] | {"steps": None}
-    return kept
+    """Raise InputError for a folder that holds a run, or anything else; nothing is changed."""
+    if (folder / "checkpoint.pt").exists():
+        raise InputError(f"{folder} holds a run already: resume it, or choose another folder")
+    left_by_a_kill = {".lock", "checkpoint.pt.new"}
+    if folder.exists() and {path.name for path in folder.iterdir()} - left_by_a_kill:
+        raise InputError(f"{folder} is not empty and holds no run: choose another folder")
 
 
 def write_atomically(path, content):
-    """A reader finds the old file or the new one and never half of one, also after a kill, or where
-    the disk is full."""
+    """Replace a file so that a reader, a kill or a full disk leaves the old file or the new one."""
     temporary = path.with_name(path.name + ".new")
     try:
         with open(temporary, "wb") as file:
@@ -1621,298 +1665,357 @@ def write_atomically(path, content):
         raise
 
 
-def read_checkpoint(folder):
-    """The checkpoint in the folder. InputError: it is missing or damaged."""
+def read_checkpoint(folder: str | os.PathLike) -> dict:
+    """The checkpoint in a folder: settings, rows, s_init and algorithm. Raises InputError if it is
+    missing or damaged."""
+    folder = pathlib.Path(os.path.expanduser(folder))
     try:
-        state = torch.load(folder / "checkpoint.pt", map_location="cpu", weights_only=True)
-        return {name: state[name] for name in ("settings", "rows", "trace_bytes", "algorithm")}
-    except Exception as error:  # torch raises many kinds for a file that is cut short
+        content = (folder / "checkpoint.pt").read_bytes()
+        # torch.load verifies no checksums, and would load a file with a flipped bit.
+        broken = zipfile.ZipFile(io.BytesIO(content)).testzip()
+        if broken:
+            raise zipfile.BadZipFile(broken)
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        return {name: state[name] for name in ("settings", "rows", "s_init", "algorithm")}
+    except FileNotFoundError:
+        raise InputError(f"there is no run in {folder}: it has no checkpoint.pt") from None
+    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
         raise damaged(folder, error) from None
 
 
 def damaged(folder, error):
-    path = folder / "checkpoint.pt"
     return InputError(
-        f"{path} cannot be loaded ({type(error).__name__}): it is missing, "
-        "damaged, or of another version; begin anew with another --out"
+        f"{folder / 'checkpoint.pt'} cannot be loaded ({type(error).__name__}): it is damaged or "
+        "of another version; start over in another folder"
     )
 
 
-def as_cell(value):
-    return "" if value is None else str(value)
+def csv_text(rows):
+    """A CSV file of dicts, with a column for every key. None is an empty cell."""
+    text = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
-def trace_of(iteration):
-    """What an iteration did, as plain data: where each trajectory began, how novel its states were
-    and to which clusters they went, and what merged."""
-    explored = []
-    for tau in iteration.trajectories:
-        novelty = [float(x) if np.isfinite(x) else None for x in tau.novelty]
-        explored.append({"start": tau.start, "novelty": novelty, "clusters": tau.clusters})
-    return {
-        "iteration": iteration.metrics["iteration"],
-        "explored": explored,
-        "additional": [tau.start for tau in iteration.additional],
-        "pairs": len(iteration.pairs),
-        "merged": list(iteration.merged.items()),
-    }
+# ------------------------------------------------------- verification (3.2; S3.2-01, S3.2-03)
 
 
-def megabytes(algorithm, iteration):
-    """Frames and snapshots that the iteration and G held."""
-    size = 0
-    for tau in iteration.trajectories + iteration.additional:
-        size += tau.frames.nbytes + sum(map(len, tau.snapshots))
-    if isinstance(algorithm, RbExplore):
-        graph = algorithm.graph
-        size += sum(arc.prefix.nbytes for arc in graph.E_parent.values())
-        size += sum(len(v.snapshot) for v in graph.clusters.values())
-    return size / 2**20
+class Seen(NamedTuple):
+    """What an environment shows after a step."""
+
+    frame: bytes
+    unit: tuple | None
+    terminated: bool = False
+    truncated: bool = False
 
 
-def unit_name(env):
-    return getattr(env, "unit_name", "units")
+def verify(explorer: RbExplore, steps: int = 10) -> dict[int, str]:
+    """Replay the actions that lead from s_init to each cluster, and compare frame and unit with the
+    centre. Then take the same random steps from the replayed state and from the restored snapshot,
+    and compare every frame, unit and end: this also reveals hidden state that no frame shows.
 
-
-def steps_to(discovered, full):
-    """Per cent of full coverage -> the step that reached it; None where none did."""
-    times = sorted(discovered.values())
-    marks = {}
-    for mark in (50, 90, 100):
-        needed = math.ceil(full * mark / 100)
-        marks[mark] = times[needed - 1] if len(times) >= needed else None
-    return marks
-
-
-def verify(algorithm):
-    """For each cluster replay its actions from s_init and restore its snapshot, and compare both
-    with its centre, exactly (S3.2-01, S3.2-03). Returns a table, and whether all agree."""
-    env = algorithm.env
-    graph = algorithm.graph
-    lines = [f"{'cluster':>9}{'visits':>9}{'steps from s_init':>19}   replayed   restored"]
-    wrong = 0
-    for v, cluster in graph.clusters.items():
-        actions = graph.actions_to(v)
-        frame, unit = play(env, cluster.snapshot, b"")
-        restored = np.array_equal(frame, cluster.frame)
-        frame, replayed_unit = play(env, algorithm.initial_state.snapshot, actions)
-        replayed = np.array_equal(frame, cluster.frame) and replayed_unit == unit
-        wrong += not (replayed and restored)
-        answers = ["exact" if right else "DIFFERS" for right in (replayed, restored)]
-        lines.append(f"{v:9}{cluster.visits:9,}{len(actions):19,}   {answers[0]:8}   {answers[1]}")
-    total = len(graph.clusters)
-    lines.append(f"{total - wrong} of {total} clusters are reached exactly, both ways")
-    return "\n".join(lines), wrong == 0
+    Returns a verdict for each cluster: "exact", or what differs."""
+    env = explorer.env
+    graph = explorer.graph
+    rng = np.random.default_rng(explorer.config.seed)
+    verdicts = {}
+    # A prefix that clusters share is replayed once: each arc of E_parent continues from the
+    # replayed state of the parent, which has a smaller number.
+    root = ParentArc(0, explorer.initial_state.frame[None], b"")
+    replayed = {0: explorer.initial_state.snapshot}  # None: the replay ended on the way
+    for v, arc in sorted({0: root, **graph.E_parent}.items()):
+        tests = rng.integers(env.action_space.n, size=steps).tolist()
+        parent = replayed[arc.parent]
+        arrived = None if parent is None else play(env, parent, arc.actions)[-1]
+        replayed[v] = None
+        after_replay = []
+        if arrived is not None and not arrived.terminated:
+            replayed[v] = env.snapshot()
+            after_replay = play(env, None, tests)
+        if v not in graph.clusters:  # it was merged
+            continue
+        cluster = graph.clusters[v]
+        restored, *after_restore = play(env, cluster.snapshot, tests)
+        if restored.frame != cluster.frame.tobytes():
+            verdicts[v] = "the snapshot does not restore the centre"
+        elif replayed[v] is None or arrived[:2] != restored[:2]:
+            verdicts[v] = "the actions do not lead to the centre"
+        elif after_replay != after_restore:
+            verdicts[v] = "the next steps after replay and after restore differ"
+        else:
+            verdicts[v] = "exact"
+    return verdicts
 
 
 def play(env, snapshot, actions):
-    """Roll back and do the actions: the frame and the coverage unit then; no frame after an end."""
-    frame = env.restore(snapshot)
+    """Restore a snapshot, unless it is None, and take actions, counted from 0, until the episode
+    ends. Returns what is seen after the restore and after each action."""
+    seen = []
+    if snapshot is not None:
+        frame = env.restore(snapshot)
+        seen.append(Seen(np.array(frame).tobytes(), unit_key(env.unit())))
     for action in actions:
-        frame, _, terminated, _, _ = env.step(action + int(env.action_space.start))
-        if terminated:
-            return None, None
-    return frame, unit_key(env.unit())
+        frame, _, terminated, truncated, _ = env.step(action + int(env.action_space.start))
+        unit = unit_key(env.unit())
+        seen.append(Seen(np.array(frame).tobytes(), unit, bool(terminated), bool(truncated)))
+        if terminated or truncated:
+            break
+    return seen
 
 
 # -------------------------------------------------------------------------------- the figures
 
 
-def draw(run):
-    """Draw the figures of a run into its folder. Returns a line that names them, or why there are
-    none: a figure that cannot be drawn never hides a finished run."""
+@contextlib.contextmanager
+def default_matplotlib():
+    """matplotlib with its default settings; afterwards the user's settings are back."""
     try:
-        names = save_figures(run.folder, run_figures(run.algorithm))
-    except Exception as error:
-        return f"{run.folder}: figures could not be drawn ({type(error).__name__}: {error})"
-    return f"{run.folder}: config.json, metrics.csv, checkpoint.pt, {', '.join(names)}"
+        import matplotlib
+    except Exception as error:  # an ImportError, or a ValueError for an invalid MPLBACKEND
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"matplotlib cannot be imported ({reason}): install it, or draw no figures"
+        ) from None
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        yield
 
 
-def run_figures(a):
-    """File name -> figure, of an algorithm as it stands."""
-    figures = {"coverage.png": curves_figure({"coverage": [a.discovered]}, a.env, a.config)}
-    level = Level(a.env, a.discovered)
-    if level.boxes:
-        title = f"{len(a.discovered)} {unit_name(a.env)} after {a.steps:,} steps (red: not visited)"
-        figures["coverage_map.png"] = maps_figure(level, {title: a.discovered}, a.steps)
-    if isinstance(a, RbExplore):
-        figures["centres.png"] = centres_figure(a.graph)
-        figures["route.gif"] = route_animation(a.graph)
-        # G itself does not know units.
-        units = {v: play(a.env, c.snapshot, b"")[1] for v, c in a.graph.clusters.items()}
-        places = {v: level.boxes[unit] for v, unit in units.items() if unit in level.boxes}
-        if places:
-            figures["graph.png"] = graph_figure(a.graph, level, places)
-    return figures
+def draw(run: Run) -> list[str]:
+    """Draw the figures of a run into its folder. Returns their file names."""
+    a = run.algorithm
+    name = run.settings["unit_name"]
+    figures = {}
+    with default_matplotlib():
+        pretrain_steps = a.config.pretrain_steps
+        figures["coverage.png"] = curves_figure({"this run": [a.coverage]}, name, pretrain_steps)
+        level = level_of(a.env, a.coverage.visited())
+        if level.boxes:
+            steps = min(a.coverage.steps, a.coverage.budget)
+            title = f"{len(a.coverage.visited())} {name} after {steps:,} steps"
+            figures["coverage_map.png"] = maps_figure(level, {title: a.coverage})
+        if isinstance(a, RbExplore):
+            figures["centres.png"] = centres_figure(a.graph)
+            figures["route.gif"] = route_animation(a.graph)
+            places = places_of(a, level)
+            if places:
+                figures["graph.png"] = graph_figure(a.graph, level, places)
+        save_figures(run.folder, figures)
+    return list(figures)
 
 
 def save_figures(folder, figures):
-    """Write them; returns their names."""
+    """Write figures, or lists of images as animations."""
     for name, figure in figures.items():
         content = io.BytesIO()
         if name.endswith(".gif"):
             figure[0].save(content, "gif", save_all=True, append_images=figure[1:], duration=80)
         else:
-            figure.savefig(content, format="png", dpi=120)
+            figure.savefig(content, format="png", dpi=120, bbox_inches="tight")
         write_atomically(folder / name, content.getvalue())
-    return list(figures)
 
 
 def new_figure(width, height):
-    """A matplotlib figure by matplotlib's own defaults, not by the user's backend or settings."""
-    os.environ["MPLBACKEND"] = "agg"  # a notebook sets one that matplotlib may refuse
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError(
-            "figures need matplotlib: pip install matplotlib, or give --no-figures"
-        ) from None
-    matplotlib.rcdefaults()
+    from matplotlib.figure import Figure  # without pyplot, which would choose a backend
+
     return Figure(figsize=(width, height), layout="constrained")
 
 
-class Level:
-    """Where units lie in a picture. boxes: unit -> (left, top, width, height): by the environment's
-    level_map(), else squares at (x, y), those of a room, (..., x, y), in a panel of its own."""
+class Level(NamedTuple):
+    """Where units lie in a picture. Boxes are (left, top, width, height)."""
 
-    def __init__(self, env, units):
-        self.picture = None
-        if hasattr(env, "level_map"):
-            self.picture, self.boxes = env.level_map()
-        else:
-            self.boxes = room_panels(units)
-        corners = [(left + w, top + h) for left, top, w, h in self.boxes.values()]
-        self.width, self.height = np.max(corners, axis=0) if corners else (1, 1)
-        self.aspect = float(np.clip(self.height / self.width, 0.2, 1.5))  # to be legible
+    boxes: dict[tuple, tuple]  # unit -> box
+    rooms: dict[str, tuple]  # name -> box
+    picture: np.ndarray | None  # (H, W, 3); None: the environment has no level_map()
+    width: int
+    height: int
 
     def show(self, panel, title):
-        panel.set(title=title, xticks=[], yticks=[], facecolor="0.15")
-        panel.set(xlim=(0, self.width), ylim=(self.height, 0))
+        panel.set_title(title, fontsize=10)
+        panel.set(xticks=[], yticks=[], facecolor="0.15", aspect="equal")
         if self.picture is not None:
-            panel.imshow(self.picture, extent=(0, self.width, self.height, 0), aspect="auto")
+            panel.imshow(self.picture, extent=(0, self.width, self.height, 0))
+        for name, (left, top, w, h) in self.rooms.items():
+            frame_x = [left, left + w, left + w, left, left]
+            frame_y = [top, top, top + h, top + h, top]
+            panel.plot(frame_x, frame_y, color="0.6", linewidth=0.8)
+            panel.text(left, top, name[:30], color="white", fontsize=6, va="bottom")
+        panel.set(xlim=(0, self.width), ylim=(self.height, 0))
 
 
-def room_panels(units):
-    """A box for each unit that ends with two whole numbers, or is one; the others have no place."""
+def level_of(env, units):
+    """The level by the environment's level_map(), else by rooms of these units: each unit that ends
+    with two whole numbers (..., x, y), or is one, is a square in the room that the rest of it
+    names. Other units have no place."""
+    if hasattr(env, "level_map"):
+        picture, boxes = env.level_map()
+        return Level(boxes, {}, picture, picture.shape[1], picture.shape[0])
     places = {}
     for unit in units:
-        if len(unit) == 1:
-            places[unit] = ((), unit[0], 0)
-        elif len(unit) > 1:
-            places[unit] = (unit[:-2], unit[-2], unit[-1])
-    places = {u: place for u, place in places.items() if all(isinstance(z, int) for z in place[1:])}
+        *name, x, y = unit if len(unit) > 1 else (*unit, 0, 0)[:2]
+        if isinstance(x, int) and isinstance(y, int):
+            places[unit] = (" ".join(map(str, name)), x, y)
     if not places:
-        return {}
-    rooms, xs, ys = zip(*places.values(), strict=True)
-    order = sorted(set(rooms), key=str)
-    across = math.ceil(math.sqrt(len(order)))
+        return Level({}, {}, None, 1, 1)
+    names, xs, ys = zip(*places.values(), strict=True)
+    names = sorted(set(names), key=lambda name: (len(name), name))  # 2 before 10
+    across = math.ceil(math.sqrt(len(names)))
+    width = max(xs) - min(xs) + 1
+    height = max(ys) - min(ys) + 1
+    rooms = {}
+    for k, name in enumerate(names):
+        rooms[name] = (k % across * (width + 1) + 1, k // across * (height + 1) + 1, width, height)
     boxes = {}
-    for unit, (room, x, y) in places.items():
-        k = order.index(room)
-        left = k % across * (max(xs) - min(xs) + 2) + x - min(xs)
-        top = k // across * (max(ys) - min(ys) + 2) + y - min(ys)
-        boxes[unit] = (left, top, 1, 1)
-    return boxes
+    for unit, (name, x, y) in places.items():
+        left, top, _, _ = rooms[name]
+        boxes[unit] = (left + x - min(xs), top + y - min(ys), 1, 1)
+    down = math.ceil(len(names) / across)
+    return Level(boxes, rooms, None, across * (width + 1) + 1, down * (height + 1) + 1)
 
 
-def coverage_curve(discovered, grid, full):
-    """Coverage after each number of steps of the grid: in %, or in units."""
-    visited = np.searchsorted(sorted(discovered.values()), grid, "right")
-    return np.minimum(100.0, visited * 100 / full) if full else visited
+def curve_of(coverage, grid):
+    """Coverage after each number of steps in the grid: in %, or in units where the full coverage is
+    unknown."""
+    visited = np.searchsorted(sorted(coverage.visited().values()), grid, "right")
+    if not coverage.full:
+        return visited.astype(float)
+    return np.minimum(100.0, visited * 100 / coverage.full)
 
 
-def curves_figure(runs, env, config):
-    """Coverage against steps: for each variant the mean of its runs, and a band from their least to
-    their most (S6.2-05). runs: variant -> first visits, unit -> step, of each run."""
-    figure = new_figure(7, 4)
+def curves_figure(groups, unit_name, pretrain_steps):
+    """Coverage against steps: for each group of runs their mean, and a band from the least to the
+    most of them (S6.2-05), up to the step that all of them have reached.
+
+    groups: label -> the coverage of each run."""
+    figure = new_figure(7, 4.5)
     panel = figure.subplots()
-    full = full_coverage(env)
-    grid = np.linspace(0, config.steps, 501).astype(int)
-    if config.pretrain_steps:
-        panel.axvspan(0, config.pretrain_steps, color="0.9", label="pretraining")
-    for k, (variant, discovered) in enumerate(runs.items()):
-        curves = np.stack([coverage_curve(d, grid, full) for d in discovered])  # (runs, grid)
-        style = ("-", "--", "-.", ":")[k % 4]  # so that curves which coincide are both seen
-        (drawn,) = panel.plot(grid, curves.mean(0), style, label=variant)
+    if pretrain_steps:
+        panel.axvspan(0, pretrain_steps, color="0.9", label="pretraining")
+    for k, (label, runs) in enumerate(groups.items()):
+        grid = np.linspace(0, min(runs[0].budget, *(c.steps for c in runs)), 501).astype(int)
+        curves = np.stack([curve_of(coverage, grid) for coverage in runs])  # (runs, grid)
+        style = ("-", "--", "-.", ":")[k % 4]  # so that curves which coincide both show
+        (line,) = panel.plot(grid, curves.mean(0), style, label=label)
         least = curves.min(0)
         most = curves.max(0)
-        panel.fill_between(grid, least, most, color=drawn.get_color(), alpha=0.2, linewidth=0)
+        panel.fill_between(grid, least, most, color=line.get_color(), alpha=0.2, linewidth=0)
+    full = runs[0].full
     panel.set_xlabel("agent steps (exploration, additional, pretraining)")
-    panel.set_ylabel(f"coverage, % of {full} {unit_name(env)}" if full else unit_name(env))
-    panel.set(xlim=(0, config.steps), ylim=(0, 102 if full else None))
-    panel.legend(loc="lower right")
+    panel.set_ylabel(f"coverage, % of {full} {unit_name}" if full else f"coverage, {unit_name}")
+    panel.set(xlim=(0, runs[0].budget), ylim=(0, 102 if full else None))
+    figure.legend(loc="outside upper center", ncols=4, fontsize=8)
     return figure
 
 
-def maps_figure(level, found, steps):
-    """Coverage maps: visited units in the colour of the step of the first visit, others crossed
-    out. found: title -> first visits, unit -> step."""
+def maps_figure(level, found):
+    """Coverage maps: visited units in the colour of their first visit. Where the environment has a
+    level_map(), the others are crossed out. found: title -> coverage."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
     across = min(3, len(found))
-    down = math.ceil(len(found) / across)
-    width = 10 if across == 1 else 5
-    figure = new_figure(width * across + 1, (width * level.aspect + 0.5) * down)
-    panels = figure.subplots(down, across, squeeze=False).ravel()
+    figure = new_figure(12, 8)
+    panels = figure.subplots(math.ceil(len(found) / across), across, squeeze=False).ravel()
     for panel in panels[len(found) :]:
         panel.axis("off")
-    for panel, (title, discovered) in zip(panels, found.items(), strict=False):
+    label = "step of the first visit"
+    for panel, (title, coverage) in zip(panels, found.items(), strict=False):
         level.show(panel, title)
-        tiles = []
-        firsts = []
-        for unit, (x, y, w, h) in level.boxes.items():
-            if unit in discovered:
-                tiles.append(Rectangle((x, y), w, h))
-                firsts.append(discovered[unit])
-            else:
-                panel.plot([x, x + w], [y, y + h], color="tab:red", linewidth=1)
-        colours = PatchCollection(tiles, cmap="viridis_r", alpha=0.7)
-        colours.set_array(firsts)
-        colours.set_clim(0, steps)
+        visited = {u: step for u, step in coverage.visited().items() if u in level.boxes}
+        tiles = [Rectangle(level.boxes[unit][:2], *level.boxes[unit][2:]) for unit in visited]
+        opacity = 1 if level.picture is None else 0.7
+        colours = PatchCollection(
+            tiles, cmap="viridis_r", alpha=opacity, edgecolor="0.15", linewidth=0.3
+        )
+        colours.set_array(list(visited.values()))
+        colours.set_clim(0, coverage.budget)
         panel.add_collection(colours)
-    bar = figure.colorbar(colours, ax=panels.tolist(), label="step of the first visit", shrink=0.8)
+        if level.picture is not None:
+            for unit in level.boxes.keys() - visited.keys():
+                left, top, w, h = level.boxes[unit]
+                panel.plot([left, left + w], [top, top + h], color="tab:red", linewidth=1)
+                label = "step of the first visit (red: not visited)"
+    bar = figure.colorbar(colours, ax=panels.tolist(), label=label, shrink=0.8)
     bar.solids.set_alpha(1)
     return figure
 
 
+def places_of(explorer, level):
+    """cluster -> the point of its centre in the level, for clusters whose unit has a place. Those
+    of one unit are spread over a grid in its box."""
+    crowds = {}
+    for v, cluster in explorer.graph.clusters.items():
+        explorer.env.restore(cluster.snapshot)
+        unit = unit_key(explorer.env.unit())
+        if unit in level.boxes:
+            crowds.setdefault(level.boxes[unit], []).append(v)
+    places = {}
+    for (left, top, w, h), crowd in crowds.items():
+        columns = max(1, round(math.sqrt(len(crowd) * w / h)))
+        rows = math.ceil(len(crowd) / columns)
+        for k, v in enumerate(crowd):
+            x = left + w * (k % columns + 0.5) / columns
+            y = top + h * (k // columns + 0.5) / rows
+            places[v] = np.array([x, y])
+    return places
+
+
 def graph_figure(graph, level, places):
-    """G over the level: a disc for each cluster, its area by its visits; arcs fainter the rarer
-    they are. places: cluster -> the box of its unit."""
-    figure = new_figure(10, 10 * level.aspect + 0.5)
+    """G over the level. A disc is a cluster, larger the more visits it has; the star is the initial
+    one. An arc tapers from its start to its end; only the busiest arcs are drawn, which together
+    have 90 % of all crossings.
+
+    places: cluster -> its point."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(12, 8)
     panel = figure.subplots()
-    level.show(panel, f"graph: {len(graph.clusters)} clusters, {len(graph.arcs)} arcs")
-    at = {}
-    crowd = Counter()
-    for v, box in places.items():
-        x, y, w, h = box
-        radius = 0.3 if crowd[box] else 0.0  # clusters of one unit stand around its middle
-        angle = 2.4 * crowd[box]
-        at[v] = (x + w * (0.5 + radius * math.cos(angle)), y + h * (0.5 + radius * math.sin(angle)))
-        crowd[box] += 1
-    busiest = max(graph.arcs.values(), default=1)
-    for (start, end), visits in graph.arcs.items():
-        if start in at and end in at:
-            share = math.sqrt(visits / busiest)  # most arcs are rare: they must not hide the others
-            xs, ys = zip(at[start], at[end], strict=True)
-            panel.plot(xs, ys, color="white", alpha=0.04 + 0.8 * share, linewidth=0.3 + 2 * share)
-    most = max(v.visits for v in graph.clusters.values())
-    sizes = [12 + 300 * graph.clusters[v].visits / most for v in at]
-    xs, ys = zip(*at.values(), strict=True)
-    discs = panel.scatter(xs, ys, sizes, list(at), cmap="plasma", edgecolors="black", zorder=3)
-    figure.colorbar(discs, label="cluster, in the order of creation", shrink=0.8)
+    busiest = sorted(graph.arcs.items(), key=lambda arc: -arc[1])
+    crossings = np.cumsum([visits for _, visits in busiest])
+    shown = busiest[: 1 + int(np.searchsorted(crossings, 0.9 * sum(graph.arcs.values())))]
+    title = f"{len(graph.clusters)} clusters; {len(shown)} of {len(graph.arcs)} arcs"
+    level.show(panel, f"{title} (90 % of the crossings), thick at their start")
+    tapers = []
+    colours = []
+    for (start, end), visits in reversed(shown):
+        if start in places and end in places:
+            strength = math.sqrt(visits / busiest[0][1])
+            along = places[end] - places[start]
+            sideways = np.array([-along[1], along[0]]) / max(np.hypot(*along), 1e-9)
+            sideways *= level.width * (0.0005 + 0.0025 * strength)
+            # On one side of the line, so that the arcs of both directions show.
+            tapers.append([places[start], places[start] + 2 * sideways, places[end]])
+            colours.append((1, 1, 1, 0.15 + 0.75 * strength))
+    panel.add_collection(PolyCollection(tapers, facecolors=colours))
+    most = max(cluster.visits for cluster in graph.clusters.values())
+    sizes = [15 + 100 * graph.clusters[v].visits / most for v in places]
+    xs, ys = np.array(list(places.values())).T
+    discs = panel.scatter(
+        xs, ys, sizes, list(places), cmap="plasma", edgecolors="black", linewidths=0.5, zorder=3
+    )
+    if 0 in places:
+        panel.plot(*places[0], "*", color="white", markeredgecolor="black", ms=12, zorder=4)
+    bar = figure.colorbar(discs, label="cluster, in the order of creation", shrink=0.8)
+    bar.ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
-def centres_figure(graph, most=80):
-    """The centres of the clusters, at most so many, evenly from all, with number and visits."""
-    ids = list(graph.clusters)
-    shown = ids[:: math.ceil(len(ids) / most)]
+def evenly(items, most):
+    """At most so many of the items, evenly chosen, the first and the last included."""
+    return [items[k] for k in np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)]
+
+
+def centres_figure(graph):
+    """The centres of at most 80 clusters, each with its number and visits."""
+    shown = evenly(list(graph.clusters), 80)
     across = min(10, len(shown))
     down = math.ceil(len(shown) / across)
     figure = new_figure(across * 1.1 + 0.2, down * 1.3 + 0.4)
-    figure.suptitle(f"{len(shown)} of {len(ids)} centres: number, visits", fontsize=9)
+    figure.suptitle(f"{len(shown)} of {len(graph.clusters)} centres: number, visits", fontsize=9)
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for panel in panels:
         panel.axis("off")
@@ -1932,175 +2035,162 @@ def viewable(frame):
 
 
 def route_animation(graph):
-    """The way from s_init to the cluster that is furthest from it: frames of an animation."""
+    """The longest full prefix in G, in at most 300 images."""
     from PIL import Image
 
     furthest = max(graph.clusters, key=lambda v: len(graph.actions_to(v)))
     states = graph.full_prefix(furthest) or [graph.clusters[0].frame]
     scale = max(1, 256 // max(states[0].shape[:2]))
-    frames = [viewable(s).repeat(scale, axis=0).repeat(scale, axis=1) for s in states]
+    frames = [viewable(s).repeat(scale, axis=0).repeat(scale, axis=1) for s in evenly(states, 300)]
     return [Image.fromarray(frame) for frame in frames]
 
 
-# ---------------------- the experiments (6.2, 6.3; S6.2-05, S6.2-06, S6.3-01, S6.3-02, S6.3-03)
-
-EXPERIMENTS = {  # variant -> what its runs alone have on the command line
-    "methods": {method: [f"--method={method}"] for method in METHODS},
-    "ablation": {"rbexplore": [], "no-merge": ["--no-merge"], "no-prefix": ["--no-prefix"]},
-    "theta-merge": {f"theta-merge-{x}": [f"--theta-merge={x}"] for x in ("0.25", "0.5", "0.75")},
-}
+# ------- the comparison of runs (6.2, 6.3; S6.2-05, S6.2-06, S6.3-01, S6.3-02, S6.3-03)
 
 
-def runs_of(args):
-    """(variant, seed) -> the command line of that run: what `args` says, then the variant's own."""
-    shared = ["--no-figures"]
-    for name, value in vars(args).items():
-        flag = name.replace("_", "-")
-        if value is None or name in ("experiment", "seeds", "seed", "out", "no_figures"):
-            continue
-        if isinstance(value, bool):
-            shared.append(f"--{flag}" if value else f"--no-{flag}")
-        else:
-            shared.append(f"--{flag}={value}")
-    first = args.seed or 0
-    runs = {}
-    for seed in range(first, first + (args.seeds or 3)):
-        for variant, options in EXPERIMENTS[args.experiment].items():
-            out = f"--out={experiment_folder(args)}/{variant}-{seed}"
-            runs[variant, seed] = [*shared, *options, f"--seed={seed}", out]
-    return runs
+class Found(NamedTuple):
+    """What a run folder says of its run."""
+
+    folder: str
+    settings: dict
+    config: Config
+    coverage: Coverage
+    rows: list[dict]  # the metrics of each iteration
+    s_init: np.ndarray
 
 
-def experiment_folder(args):
-    return pathlib.Path(args.out or f"runs/{args.experiment}-{args.env or 'maze'}")
+CURVE = ("iteration", "steps", "units", "coverage")  # the columns of curves.csv
 
 
-def experiment(args):
-    """All runs, side by side where there are cores; then what they found. A run that fails is named
-    when all others are done."""
-    runs = {key: parser().parse_args(command) for key, command in runs_of(args).items()}
-    for run in runs.values():
-        check_same(run)
-    settings = settings_of(next(iter(runs.values())))
-    env = make_env(settings["env"], **options_of(settings))  # its errors show before any run
-    side_by_side = max(1, cores() // (settings["workers"] * settings["threads"]))
-    where = f"in {experiment_folder(args)}, the log of each beside its folder"
-    print(f"{len(runs)} runs, {side_by_side} at a time, {where}", flush=True)
-    with ThreadPoolExecutor(side_by_side) as pool:
-        jobs = [pool.submit(run_apart, command) for command in runs_of(args).values()]
-        try:
-            codes = [job.result() for job in jobs]
-        except BaseException:  # Ctrl-C: no run is begun any more, and those that run are ended
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-    found = {}
-    failed = []
-    for ((variant, seed), run), code in zip(runs.items(), codes, strict=True):
-        if code == 0:
-            discovered = read_checkpoint(pathlib.Path(run.out))["algorithm"]["discovered"]
-            found.setdefault(variant, {})[seed] = discovered
-        else:
-            failed.append(f"{run.out} (exit code {code})")
-    if found:
-        report(args, env, Config(**settings["config"]), found)
-    env.close()
-    if failed:
+def read_run(folder):
+    state = read_checkpoint(folder)
+    settings = state["settings"]
+    config = Config(**settings["config"])
+    coverage = Coverage(settings["full_coverage"], config.steps)
+    coverage.load_state_dict(state["algorithm"]["coverage"])
+    return Found(folder, settings, config, coverage, state["rows"], state["s_init"].numpy())
+
+
+def compare(folders: list[str], out: str | os.PathLike, figures: bool = True) -> str:
+    """Compare the runs in these folders, finished or not, of one environment and budget. Write
+    table.csv, curves.csv, curves.png (figures 5 and 6) and maps.png (figure 4) to the folder `out`.
+    Returns the table, in Markdown.
+
+    Raises InputError for runs that cannot be compared."""
+    groups = group([read_run(folder) for folder in folders])
+    out = pathlib.Path(os.path.expanduser(out))
+    out.mkdir(parents=True, exist_ok=True)
+    table = [table_row(label, runs) for label, runs in groups.items()]
+    write_atomically(out / "table.csv", csv_text(table).encode())
+    curves = [
+        {"group": label, "seed": run.config.seed} | {name: row[name] for name in CURVE}
+        for label, runs in groups.items()
+        for run in runs
+        for row in run.rows
+    ]
+    write_atomically(out / "curves.csv", csv_text(curves).encode())
+    if figures:
+        with default_matplotlib():
+            save_figures(out, comparison_figures(groups))
+    lines = [list(table[0]), ["---"] * len(table[0]), *(row.values() for row in table)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def group(runs):
+    """label -> runs whose settings are equal except for the seed. A label names the method, unless
+    it is rbexplore, and the fields that differ between groups and from the default."""
+    config_of = {}
+    members = {}
+    for run in runs:
+        check_comparable(runs[0], run)
+        method = run.settings["method"]
+        config = asdict(replace(run.config, seed=0))
+        if method != "rbexplore":  # these skip pretraining and have L = 0
+            del config["pretrain_steps"], config["L"]
+        key = (method, *config.values())
+        config_of[key] = config
+        members.setdefault(key, []).append(run)
+    default = asdict(default_config(runs[0].settings.get("env")))
+    groups = {}
+    for key, config in config_of.items():
+        words = [] if key[0] == "rbexplore" else [key[0]]
+        for name, value in config.items():
+            differs = any(other.get(name, value) != value for other in config_of.values())
+            if differs and value != default[name]:
+                if isinstance(value, bool):
+                    words.append(name if value else f"no {name}")
+                else:
+                    words.append(f"{name} {value}")
+        groups[", ".join(words) or "rbexplore"] = members[key]
+    return groups
+
+
+def check_comparable(one, other):
+    """Raise InputError unless two runs have the same environment and budget."""
+    for name in ("env", "level", "full_coverage", "unit_name", "steps"):
+        values = [(run.settings | asdict(run.config)).get(name) for run in (one, other)]
+        if values[0] != values[1]:
+            raise InputError(
+                f"{one.folder} and {other.folder} cannot be compared: {name} is {values[0]} in the "
+                f"one and {values[1]} in the other"
+            )
+    same_size = one.s_init.shape == other.s_init.shape
+    if same_size and not np.array_equal(one.s_init, other.s_init):
         raise InputError(
-            f"failed, as their logs tell: {', '.join(failed)}; the same command tries these again"
+            f"{one.folder} and {other.folder} cannot be compared: their initial states differ"
         )
-    return 0
 
 
-def check_same(run):
-    """Raise InputError where the folder of a run holds one of another configuration."""
-    if not (pathlib.Path(run.out) / "config.json").exists():
-        return
-    found = recorded_settings(run.out, parser().parse_args([]))
-    wanted = settings_of(run)
-    same_steps = found["config"]["steps"] == wanted["config"]["steps"]
-    if fixed(found) != fixed(wanted) or not same_steps:
-        raise InputError(f"{run.out} holds a run of another configuration: choose another --out")
+def table_row(label, runs):
+    """The row of a group: coverage at the end in %, or in units where full coverage is unknown; the
+    median of all runs' steps to 50, 90 and 100 %."""
+    ends = [curve_of(run.coverage, run.config.steps) for run in runs]
+    unfinished = sum(run.coverage.steps < run.config.steps for run in runs)
+    row = {
+        "": label,
+        "runs": f"{len(runs)} ({unfinished} unfinished)" if unfinished else f"{len(runs)}",
+        "mean": f"{np.mean(ends):.1f}",
+        "min - max": f"{min(ends):.1f} - {max(ends):.1f}",
+    }
+    if runs[0].coverage.full:
+        marks = [steps_to(run.coverage) for run in runs]
+        row["at 100 %"] = f"{sum(mark[100] is not None for mark in marks)} of {len(runs)}"
+        for percent in (50, 90, 100):
+            median = np.median([mark[percent] or math.inf for mark in marks])
+            row[f"to {percent} %"] = f"{median:,.0f}" if median < math.inf else "-"
+    return row
 
 
-def run_apart(command):
-    """Do a run in a process of its own, or what is left of it. Returns its exit code."""
-    process = multiprocessing.get_context("spawn").Process(target=run_into_log, args=(command,))
-    process.start()
-    process.join()
-    word = "done" if process.exitcode == 0 else "failed"
-    print(f"{parser().parse_args(command).out}: {word}", flush=True)
-    return process.exitcode
+def steps_to(coverage):
+    """Percentage of full coverage -> the step that reached it; None if none did."""
+    times = sorted(coverage.visited().values())
+    marks = {}
+    for mark in (50, 90, 100):
+        needed = math.ceil(coverage.full * mark / 100)
+        marks[mark] = times[needed - 1] if len(times) >= needed else None
+    return marks
 
 
-def run_into_log(command):
-    """In a process of its own: the run, its output in a file beside its folder."""
-    end_with_parent()
-    folder = pathlib.Path(parser().parse_args(command).out)
-    if (folder / "config.json").exists():
-        command = ["--resume", str(folder), "--no-figures"]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        open(f"{folder}.log", "a", buffering=1) as log,
-        contextlib.redirect_stdout(log),
-        contextlib.redirect_stderr(log),
-    ):
-        sys.exit(main(command))
+def comparison_figures(groups):
+    curves = {}
+    maps = {}
+    for label, runs in groups.items():
+        name = runs[0].settings["unit_name"]
+        curves[label] = [run.coverage for run in runs]
+        most = best(curves[label])
+        maps[f"{label}: {len(most.visited())} {name}"] = most
+    figures = {"curves.png": curves_figure(curves, name, pretrain_steps=0)}
+    env_type = ENVIRONMENTS.get(runs[0].settings.get("env"))
+    env = env_type(runs[0].settings["level"]) if hasattr(env_type, "level_map") else None
+    level = level_of(env, {unit for coverage in maps.values() for unit in coverage.visited()})
+    if level.boxes:
+        figures["maps.png"] = maps_figure(level, maps)
+    return figures
 
 
-def end_with_parent():
-    """End this process when the one that started it ends, also where that was killed."""
-
-    def watch():
-        multiprocessing.parent_process().join()
-        os._exit(1)
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def report(args, env, config, found):
-    """Curves, figures, and a line for each run. found: variant -> seed -> first visits."""
-    folder = experiment_folder(args)
-    full = full_coverage(env)
-    grid = np.linspace(0, config.steps, 201).astype(int)
-    rows = ["variant,seed,steps,coverage"]
-    for variant, of_seed in found.items():
-        for seed, discovered in of_seed.items():
-            curve = coverage_curve(discovered, grid, full)
-            rows += [f"{variant},{seed},{x},{y:.4f}" for x, y in zip(grid, curve, strict=True)]
-            marks = f"% at the end; steps to {steps_to(discovered, full)}" if full else "units"
-            print(f"{variant:17} seed {seed}: {curve[-1]:6.1f} {marks}")
-    write_atomically(folder / "curves.csv", ("\n".join(rows) + "\n").encode())
-    if args.no_figures:
-        return
-    runs = {variant: list(of_seed.values()) for variant, of_seed in found.items()}
-    figures = {"curves.png": curves_figure(runs, env, config)}
-    if args.experiment == "methods":
-        maps = {f"{v}: {len(best(of))} {unit_name(env)}": best(of) for v, of in runs.items()}
-        level = Level(env, {unit for discovered in maps.values() for unit in discovered})
-        if level.boxes:
-            figures["maps.png"] = maps_figure(level, maps, config.steps)
-    print(f"{folder}: curves.csv, {', '.join(save_figures(folder, figures))}")
-
-
-def best(runs):
-    """Of a variant's runs the one that covers most at the end (S6.2-06)."""
-    return max(runs, key=len)
-
-
-def cores():
-    """How many cores this process may use."""
-    try:
-        allowed = len(os.sched_getaffinity(0))
-    except AttributeError:  # not every system has it
-        allowed = os.cpu_count() or 1
-    try:
-        quota, period = pathlib.Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        return max(1, min(allowed, int(quota) // int(period)))  # of a container
-    except (OSError, ValueError):
-        return allowed
+def best(coverages):
+    """Of a group's runs, the one that covers most at the end (S6.2-06)."""
+    return max(coverages, key=lambda coverage: len(coverage.visited()))
 
 
 # --------------------------------------------------------------------------- the command line
@@ -2126,245 +2216,347 @@ def parser():
     flag = {"action": "store_true", "default": None}
     add("--env", "maze, pop (Prince of Persia) or montezuma (default: maze)")
     add("--level", "1 to 3 of the maze, 1 to 14 of pop (default: 1)", type=int)
-    add("--rom", "pop: the NES cartridge's file, which you bring")
-    add("--state", "pop: a start state, gzip of the emulator's")
+    add("--rom", "pop: your image of the NES cartridge")
+    add("--state", "pop: a start state, gzip of an emulator state")
     add(
         "--method",
-        "what explores (6.2): RbExplore; PPO of RND's or of ICM's bonus; random "
-        "actions; RbExplore with Go-Explore's cells for R (default: rbexplore)",
+        "what explores (6.2): RbExplore, PPO with the bonus of RND or of ICM, random actions, or "
+        "RbExplore with Go-Explore's cells instead of R (default: rbexplore)",
         choices=METHODS,
     )
     add(
         "--config",
-        "values of the fields below (default: maze for the maze, else paper)",
+        "the values of the fields below (default: maze for the maze, else paper)",
         choices=list(CONFIGS),
     )
-    add("--out", "run folder (default: runs/<env>-<seed>)", metavar="RUN")
-    add("--resume", "go on with the run in this folder; with --steps beyond its end", metavar="RUN")
+    add("--out", "run folder (default: runs/<env>-<seed>)", metavar="FOLDER")
+    add("--resume", "continue the run in this folder; --steps extends it", metavar="RUN")
     add(
         "--verify",
-        "check that each cluster of this run is reached exactly, by its actions and by "
-        "its snapshot; exit code 1 if one is not",
+        "check that the clusters of this run are reached exactly; exit code 1 if one is not",
         metavar="RUN",
     )
     add(
-        "--experiment",
-        "do all runs of figures 4 and 5 (6.2) or 6 (6.3), or go on with them",
-        choices=list(EXPERIMENTS),
+        "--compare",
+        "compare runs of one environment and budget: print a table, and write it, the curves and "
+        "two figures to --out (default: runs/comparison)",
+        nargs="+",
+        metavar="RUN",
     )
-    add("--seeds", "with --experiment: runs of each variant, from --seed on (default: 3)", type=int)
-    add("--stop-at-full", "end as soon as all is covered", **flag)
-    add("--trace", "write what each iteration did to trace.jsonl", **flag)
-    add("--no-figures", "draw none", **flag)
-    add("--workers", "processes that walk; any number, same result (default: 1)", type=int)
-    add("--threads", "of the arithmetic; another number, other roundings (default: 1)", type=int)
-    add("--device", "where the networks are: cpu, cuda, cuda:1, ... (default: cpu)")
-    group = p.add_argument_group("configuration", "In brackets the paper's value | the maze's.")
+    add("--stop-at-full", "stop at full coverage", **flag)
+    add("--no-figures", "draw no figures", **flag)
+    add("--workers", "processes that walk; the result is the same (default: 1)", type=count)
+    add("--threads", "threads of the arithmetic; changes the rounding (default: 1)", type=count)
+    add("--device", "device of the networks: cpu, cuda, cuda:1, ... (default: cpu)")
+    heading = f"In brackets the values of --config {' | '.join(CONFIGS)}, where they differ."
+    configuration = p.add_argument_group("configuration", heading)
     for f in fields(Config):
-        values = dict.fromkeys(str(getattr(config, f.name)) for config in CONFIGS.values())
+        values = [str(getattr(config, f.name)) for config in CONFIGS.values()]
+        shown = " | ".join(values) if len(set(values)) > 1 else values[0]
         form = {"type": f.type, "metavar": f.type.__name__}
         if f.type is bool:
             form = {"action": argparse.BooleanOptionalAction}
-        meaning = f"[{' | '.join(values)}] {f.metadata['meaning']}"
-        group.add_argument("--" + f.name.replace("_", "-"), default=None, help=meaning, **form)
+        meaning = f"[{shown}] {f.metadata['meaning']}"
+        configuration.add_argument(flag_of(f.name), default=None, help=meaning, **form)
     return p
 
 
+def count(text):
+    """A number of workers or threads."""
+    if not text.isdecimal() or not 1 <= int(text) <= 1000:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 1 to 1,000")
+    return int(text)
+
+
+def flag_of(name):
+    return "--" + name.replace("_", "-")
+
+
+def default_config(env):
+    """The configuration of an environment unless --config names another."""
+    return MAZE if env == "maze" else Config()
+
+
 def settings_of(args):
-    """What makes a run, and what is good to know of it: for config.json."""
+    """The settings of a new run."""
     env = args.env or "maze"
+    base = CONFIGS[args.config] if args.config else default_config(env)
     given = {f.name: getattr(args, f.name) for f in fields(Config)}
     given = {name: value for name, value in given.items() if value is not None}
-    base = CONFIGS[args.config or ("maze" if env == "maze" else "paper")]
-    method = args.method or "rbexplore"
-    if method != "rbexplore":  # no R is learned, so nothing is spent on what serves it alone
-        given |= {"pretrain_steps": 0, "L": 0}
-    settings = {
-        "method": method,
+    level = args.level
+    if level is None and env in ("maze", "pop"):
+        level = 1
+    return {
+        "method": args.method or "rbexplore",
         "env": env,
-        "level": args.level,
+        "level": level,
         "rom": absolute(args.rom),
         "state": absolute(args.state),
         "config": asdict(replace(base, **given)),
         "device": args.device or "cpu",
-        "threads": 1 if args.threads is None else args.threads,
-        "workers": 1 if args.workers is None else args.workers,
-        "versions": versions(),
+        "threads": args.threads or 1,
+        "workers": args.workers or 1,
+        "versions": {
+            "python": platform.python_version(),
+            "torch": str(torch.__version__),
+            "numpy": np.__version__,
+            "gymnasium": gymnasium.__version__,
+        },
     }
-    check_counts(settings)
+
+
+def recorded_settings(args, folder):
+    """The settings of the run in a folder, with the changes of the command line, none of which
+    changes the result except for more steps."""
+    settings = read_checkpoint(folder)["settings"]
+    if "env" not in settings:
+        raise InputError(
+            f"{folder} was made in Python, and its environment is not known here: use "
+            "Run(folder, algorithm).resume() or verify(algorithm) there"
+        )
+    steps = settings["config"]["steps"]
+    if args.steps is not None and args.steps < steps:
+        raise InputError(
+            f"steps is {args.steps}: a run can be extended, not shortened; give {steps} or more"
+        )
+    settings["config"]["steps"] = args.steps or steps
+    for name in ("device", "workers", "rom", "state"):
+        value = getattr(args, name)
+        if value is not None:
+            settings[name] = absolute(value) if name in ("rom", "state") else value
     return settings
-
-
-def check_counts(settings):
-    for name in ("threads", "workers"):
-        value = settings[name]
-        if not isinstance(value, int) or not 1 <= value <= 1000:
-            raise InputError(f"{name} is {value}: give a number from 1 to 1,000")
 
 
 def absolute(path):
-    return path and os.path.abspath(path)
+    return path and os.path.abspath(os.path.expanduser(path))
 
 
-def options_of(settings):
-    """The options with which the environment is made."""
-    options = {name: settings[name] for name in ("level", "rom", "state")}
-    options["frame_size"] = settings["config"]["frame_size"]
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def versions():
-    return {
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "numpy": np.__version__,
-        "gymnasium": gymnasium.__version__,
-    }
-
-
-def recorded_settings(folder, args):
-    """The settings of the run in the folder; of the command line what cannot change its result."""
-    may_change = ["resume", "verify", "workers", "rom", "state", "no_figures"]
-    may_change += ["device"] if args.verify else ["steps", "stop_at_full"]
+def check_options(args, action, allowed):
+    """Raise InputError for options that are empty or do not go together with an action."""
     for name, value in vars(args).items():
-        if value is not None and name not in may_change:
+        if value == "" or value == [""]:
+            raise InputError(f"{flag_of(name)} is empty: give a value, or leave it out")
+        if action and value is not None and name not in (action, *allowed):
             raise InputError(
-                f"--{name.replace('_', '-')} does not go with a run that was begun: "
-                "leave it out, or begin anew with another --out"
+                f"{flag_of(name)} cannot be given with {flag_of(action)}: leave it out"
             )
-    path = pathlib.Path(folder) / "config.json"
-    try:
-        settings = json.loads(path.read_text())
-        steps = Config(**settings["config"]).steps
-        if settings.keys() != settings_of(parser().parse_args([])).keys():
-            raise KeyError("settings")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(
-            f"{path} cannot be used ({type(error).__name__}): there is no run in "
-            f"{folder}, or it is damaged, or of another version"
-        ) from None
-    if settings["versions"] != versions():
-        print(
-            f"note: {folder} was begun with {settings['versions']}, and this is {versions()}: "
-            "the result may differ in the last digits"
-        )
-    if args.steps is not None and args.steps < steps:
-        raise InputError(f"steps is {args.steps}: a run is extended, not cut; give {steps} or more")
-    settings["config"]["steps"] = args.steps or steps
-    settings["rom"] = absolute(args.rom) or settings["rom"]
-    settings["state"] = absolute(args.state) or settings["state"]
-    settings["device"] = args.device or settings["device"]
-    if args.workers is not None:
-        settings["workers"] = args.workers
-    check_counts(settings)
-    return settings
 
 
-def prepare(settings):
-    """Fix threads and determinism. Returns the algorithm, and the executor of its workers, if
-    any."""
+def make_algorithm(settings, stack):
+    """The method of the settings. The exit stack closes its environment and workers."""
     torch.set_num_threads(settings["threads"])
-    torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # nothing here reads any
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # cuBLAS wants it for that
+    device = settings["device"]
+    if device != "cpu":  # on the CPU, every operation used here is deterministic
+        torch.use_deterministic_algorithms(True)
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # which cuBLAS needs for that
     try:
-        torch.zeros(1, device=settings["device"]).cpu()
+        torch.zeros(1, device=device).cpu()
     except (RuntimeError, AssertionError, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise InputError(
-            f"device {settings['device']} cannot be used ({reason}): give another "
-            "--device, such as cpu"
+            f"device {device} cannot be used ({reason}): choose another --device, such as cpu"
         ) from None
     executor = None
     if settings["workers"] > 1:
         context = multiprocessing.get_context("spawn")
         executor = ProcessPoolExecutor(settings["workers"], context, initializer=end_with_parent)
-    env_fn = functools.partial(make_env, settings["env"], **options_of(settings))
+        stack.callback(executor.shutdown, cancel_futures=True)
+    options = {name: settings[name] for name in ("level", "rom", "state")}
+    options = {name: value for name, value in options.items() if value is not None}
+    for name in ("frame_size", "frameskip"):
+        options[name] = settings["config"][name]
+    env_fn = functools.partial(make_env, settings["env"], **options)
     config = Config(**settings["config"])
-    algorithm = make_method(settings["method"], env_fn, config, settings["device"], executor)
-    return algorithm, executor
+    algorithm = make_method(settings["method"], env_fn, config, device, executor)
+    stack.callback(algorithm.env.close)
+    return algorithm
 
 
-def main(argv=None):
-    """The command line. Returns the exit code: 0; 1 where --verify finds a difference; 2 for what
-    the user can put right; 130 after Ctrl-C."""
+def end_with_parent():
+    """In a worker: end with the process that started it, even if that is killed."""
+
+    def watch():
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    threading.Thread(target=watch, daemon=True).start()
+
+
+HEADING = (
+    " iter    phase     steps  units   %Cov clusters  new merged R's loss  TPR  TNR  novel     s"
+)
+ROW = (
+    "{iteration:5} {phase:>8} {steps:9,} {units:6} {coverage:6.1%} {clusters:8} {added:4} "
+    "{merged:6} {r_loss:8.3f} {r_tpr:4.2f} {r_tnr:4.2f} {novel_share:6.1%} {seconds:5.1f}"
+)
+
+
+def table_line(row):
+    """What is said of an iteration; - for what it has not."""
+    known = {name: value for name, value in row.items() if value is not None}
+    line = ROW.format_map(defaultdict(lambda: math.nan, known))
+    return line.replace("nan%", "   -").replace("nan", "  -")
+
+
+def show(run):
+    """Iterate a run, print a line for each iteration under a bar over the steps, and a summary."""
+    coverage = run.algorithm.coverage
+    config = run.algorithm.config
+    name = run.settings["unit_name"]
+    target = f"{coverage.full} {name} to cover" if coverage.full else "full coverage is unknown"
+    say(
+        f"{run.settings['method']}: {target}; seed {config.seed}; {config.steps:,} steps, "
+        f"{config.pretrain_steps:,} of them pretraining; run folder {run.folder}\n{HEADING}"
+    )
     try:
-        return command(parser().parse_args(argv))
+        with progress(None, "steps", total=config.steps) as bar:
+            bar.update(coverage.steps)
+            for _ in run:
+                say(table_line(run.rows[-1]))
+                bar.update(coverage.steps - bar.n)
+    finally:
+        seconds = sum(row["seconds"] for row in run.rows)
+        text = f"{coverage.steps:,} steps, {seconds:.0f} s: {len(coverage.visited())} {name}"
+        if coverage.full:
+            share = coverage.metrics()["coverage"]
+            reached = [f"{mark} %: {s or 'not reached'}" for mark, s in steps_to(coverage).items()]
+            text += f" of {coverage.full}, {share:.1%}; steps to {', '.join(reached)}"
+        say(text)
+
+
+def say(text, file=None):
+    """Print a line above the progress bars."""
+    file = file or sys.stdout
+    if file is not None:  # None: the process was started without it
+        progress(None, "").write(text, file=file)
+        file.flush()
+
+
+HINTS = {  # what the user can do about an OSError
+    errno.ENOSPC: "make room, or choose another --out",
+    errno.EDQUOT: "make room, or choose another --out",
+    errno.ENOLCK: "choose an --out on a file system that has locks",
+    None: "choose an --out that can be written",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command line. Returns the exit code: 0; 1 if --verify finds a difference; 2 for what the
+    user can put right; 130 after Ctrl-C; 143 after SIGTERM."""
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # for names that its encoding lacks
+    try:
+        with sigterm_as_interrupt(), warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: say(f"warning: {message}", sys.stderr)
+            return command(parser().parse_args(argv))
     except InputError as error:
         problem = str(error)
+    except KeyboardInterrupt as interrupt:
+        return interrupt.args[0] if interrupt.args else 130
     except OSError as error:
-        place = error.filename or "a file"  # a full disk names none
-        problem = f"{place} cannot be written: {error.strerror}; make room, or choose another place"
-    except BrokenProcessPool:
-        problem = "a worker process died, of memory perhaps: --resume with fewer --workers"
-    except MemoryError:
-        problem = "out of memory: give smaller values, of M, L or trajectory_steps for example"
-    except KeyboardInterrupt:
-        return 130
+        problem = (
+            f"{error.filename or 'a file'}: {error.strerror}; {HINTS.get(error.errno, HINTS[None])}"
+        )
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        problem = "out of memory: choose smaller values of M, trajectory_steps, L or r_batch"
     print(f"rbexplore: {problem}", file=sys.stderr)
     return 2
 
 
+def is_out_of_memory(error):
+    """Whether an exception of NumPy or torch, on any device, means that memory is exhausted."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return True
+    return "can't allocate memory" in str(error) or "not enough memory" in str(error)
+
+
+@contextlib.contextmanager
+def sigterm_as_interrupt():
+    """Treat SIGTERM, by which Slurm and Docker stop a job, as Ctrl-C."""
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt(143)  # the exit code
+
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread can handle signals
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def command(args):
     """Do what the options say. Returns the exit code."""
-    check_options(args)
-    if args.experiment:
-        return experiment(args)
-    if args.verify:
-        return verified(args)
-    settings = recorded_settings(args.resume, args) if args.resume else settings_of(args)
-    folder = args.resume or args.out or f"runs/{settings['env']}-{settings['config']['seed']}"
-    algorithm, executor = prepare(settings)
-    try:
-        run = Run(folder, algorithm, settings, bool(args.trace))
-        if args.resume:
-            run.resume()
-        else:
-            run.begin()
-        complete = run.go(args.stop_at_full)
-        print(run.summary())
-        if not args.no_figures:
-            print(draw(run))
-        run.lock.release()
-    finally:
-        algorithm.env.close()
-        if executor:
-            executor.shutdown(cancel_futures=True)
-    if complete:
+    if args.compare:
+        check_options(args, "compare", ["out", "no_figures"])
+        say(compare(args.compare, args.out or "runs/comparison", not args.no_figures))
         return 0
-    print(f"go on with: python rbexplore.py --resume {folder}")
-    return 130
+    if args.verify:
+        check_options(args, "verify", ["device", "rom", "state"])
+        return verify_command(args)
+    if args.resume:
+        unchanged = ["device", "workers", "rom", "state", "no_figures", "stop_at_full"]
+        check_options(args, "resume", ["steps", *unchanged])
+    else:
+        check_options(args, None, [])
+    return run_command(args)
 
 
-def check_options(args):
-    """Raise InputError for options that are empty or do not go together."""
-    for name, value in vars(args).items():
-        if value == "":
-            raise InputError(f"--{name.replace('_', '-')} is empty: give a value, or leave it out")
-    if sum(map(bool, (args.experiment, args.resume, args.verify))) > 1:
-        raise InputError("--experiment, --resume and --verify exclude each other: give one of them")
-    if args.seeds is not None and not (args.experiment and args.seeds > 0):
-        raise InputError(f"seeds is {args.seeds}: give 1 or more, with --experiment")
-    if args.experiment and (args.method or args.trace or args.stop_at_full):
-        raise InputError(
-            "--experiment chooses the methods and does whole runs: leave --method, "
-            "--trace and --stop-at-full out"
+def run_command(args):
+    """Begin or resume a run, and show it. Returns the exit code."""
+    settings = recorded_settings(args, args.resume) if args.resume else settings_of(args)
+    default_folder = f"runs/{settings['env']}-{settings['config']['seed']}"
+    folder = args.resume or args.out or default_folder
+    if not args.no_figures:
+        with default_matplotlib():
+            pass  # so that a missing matplotlib is reported now, and not at the end
+    code = 0
+    with contextlib.ExitStack() as stack:
+        algorithm = make_algorithm(settings, stack)
+        run = Run(folder, algorithm, settings, bool(args.stop_at_full))
+        stack.enter_context(run.resume() if args.resume else run.begin())
+        try:
+            show(run)
+        except KeyboardInterrupt as interrupt:
+            code = interrupt.args[0] if interrupt.args else 130
+        if not args.no_figures:
+            say(f"{folder}: checkpoint.pt, config.json, metrics.csv, {figure_names(run)}")
+    if code:
+        say(
+            "stopped after the last complete iteration; to resume: "
+            f"python rbexplore.py --resume {folder}"
         )
-    if not args.no_figures and not args.verify:
-        new_figure(1, 1)  # so that a missing matplotlib shows now, and not at the end
+    return code
 
 
-def verified(args):
-    """Check the run in a folder. Returns the exit code."""
-    settings = recorded_settings(args.verify, args)
+def figure_names(run):
+    """Draw the figures and name them, or say why there are none: a figure that cannot be drawn must
+    not hide a finished run."""
+    try:
+        return ", ".join(draw(run))
+    except Exception as error:
+        return f"but no figures ({type(error).__name__}: {error})"
+
+
+def verify_command(args):
+    """Verify the run in a folder, and print a table. Returns the exit code."""
+    settings = recorded_settings(args, args.verify)
     if settings["method"] not in ("rbexplore", "cells"):
         raise InputError(f"{args.verify} is a run of {settings['method']}, which has no clusters")
-    algorithm, _ = prepare(settings | {"workers": 1})
-    Run(args.verify, algorithm, settings).load()
-    table, good = verify(algorithm)
-    algorithm.env.close()
-    print(table)
-    return 0 if good else 1
+    with contextlib.ExitStack() as stack:
+        explorer = make_algorithm(settings | {"workers": 1}, stack)
+        Run(args.verify, explorer, settings).load()
+        verdicts = verify(explorer)
+    for v, verdict in verdicts.items():
+        say(f"cluster {v}, {len(explorer.graph.actions_to(v)):,} steps from s_init: {verdict}")
+    exact = list(verdicts.values()).count("exact")
+    say(f"{exact} of {len(verdicts)} clusters are reached exactly")
+    return 0 if exact == len(verdicts) else 1
 
 
 if __name__ == "__main__":
