@@ -188,8 +188,9 @@ class Moment:
             self.refuse(str(error))
 
     def compare(self, what, first, second):
-        for name in first.keys() & second.keys():  # restore() and reset() show frame and unit only
-            if np.array_equal(first[name], second[name]):
+        for name in first:
+            # restore() and reset() show frame and unit only.
+            if name not in second or np.array_equal(first[name], second[name]):
                 continue
             detail = ""
             if name == "frame":
@@ -623,6 +624,10 @@ class EmulatorEnv(PersistentEnv):
 
     def _begin(self, game, actions, frame_size, frameskip):
         """Make the current state s_init. `game` keeps the snapshots of different games apart."""
+        for name, value in (("frameskip", frameskip), ("frame_size", frame_size)):
+            if not isinstance(value, int) or value < 1:
+                self.close()
+                raise InputError(f"{name} is {value!r}: it must be an int, 1 or more")
         self.frameskip = frameskip
         self.action_space = gymnasium.spaces.Discrete(actions)
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
@@ -895,7 +900,7 @@ def unit_key(unit) -> tuple[int | str, ...] | None:
             key.append(int(part))
         else:
             raise InputError(
-                f"unit() gives {unit!r:.60}: it must give an int, a str, a tuple of them, or None"
+                f"unit() returns {unit!r:.60}: it must be an int, a str, a tuple of them, or None"
             )
     return tuple(key)
 

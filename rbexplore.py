@@ -20,8 +20,8 @@ iteration has five steps (section 4), which are the five calls in `RbExplore.ite
     n, N                Config.n, Config.N           similar: fewer than n steps apart; dissimilar:
                                                      more than N
     G = (V, E)          Graph.clusters, Graph.arcs   clusters, and arcs between them
-    v = (s, snap)       Cluster                      a cluster is its centre; in the code v is its
-                                                     number
+    v = (s, snap)       Cluster                      a centre and its snapshot; in the code, v is
+                                                     the number of the cluster
     E_parent            Graph.E_parent               the arc from v to the cluster it came from
     theta_sim           Config.theta_sim             a state joins a cluster if R > theta_sim
     theta_merge         Config.theta_merge           two clusters merge if R > theta_merge
@@ -102,7 +102,7 @@ class Config:
     n: int = option(5, "similar: states fewer than n steps apart (6.1)", 1)
     N: int = option(25, "dissimilar: states more than N steps apart (6.1)", 1)
     prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
-    epochs: int = option(4, "passes of R over the pairs of an iteration (R19)", 1)
+    epochs: int = option(4, "passes of R over balanced pairs of an iteration (R19)", 1)
     theta_sim: float = option(0.5, "a state joins a cluster if R is above this (6.1)", 0, 1)
     theta_merge: float = option(0.5, "two clusters merge if R is above this (6.1)", 0, 1)
     merge: bool = option(True, "merge clusters (4.2; off: ablation of 6.3)")
@@ -152,8 +152,8 @@ def check_field(f, value):
         raise InputError(f"{f.name} is {value}: choose a number from {low:,} to {high:,}")
 
 
-# For small images, a small budget and a CPU. Everything else is the paper's. n and N: a step of the
-# maze is a whole tile (R30).
+# For small images, a small budget and a CPU. What is not listed is as in the paper. n and N: a step
+# of the maze is a whole tile (R30).
 MAZE = Config(
     steps=100_000,
     pretrain_steps=4_000,
@@ -195,16 +195,17 @@ CONFIGS = {"paper": Config(), "maze": MAZE, "small": SMALL}
 
 @dataclass
 class Iteration:
-    """The result of one iteration. starts, trajectories, novelty and clusters have one entry per
-    exploration trajectory, in the same order. The compared methods have metrics only."""
+    """The result of one iteration. starts, trajectories, clusters and, unless L is 0, novelty have
+    one entry per exploration trajectory, in the same order. An agent's iteration has metrics
+    only."""
 
     metrics: dict
     starts: list[int] = field(default_factory=list)  # step 1: the sampled clusters
     trajectories: list["Trajectory"] = field(default_factory=list)  # step 1
-    novelty: list[np.ndarray] = field(default_factory=list)  # step 2: each state's reward, (T,)
+    novelty: list[np.ndarray] = field(default_factory=list)  # step 2: of each state, (T,)
     additional: list["Trajectory"] = field(default_factory=list)  # step 2
     pairs: list[tuple] = field(default_factory=list)  # step 2: triples (s_1, s_2, y)
-    clusters: list[list[int]] = field(default_factory=list)  # step 4: each state's, before merging
+    clusters: list[list[int]] = field(default_factory=list)  # step 4: of each state, before merging
     merged: dict[int, int] = field(default_factory=dict)  # step 4: cluster -> its survivor
 
 
@@ -255,7 +256,7 @@ class RbExplore:
         theta_sim = self.theta_sim_now()
         clusters_before = len(self.graph.clusters)
         # A new generator per iteration keeps random states out of checkpoints. One generator per
-        # step keeps the draws of one step from shifting those of another.
+        # step keeps the draws of one step from shifting those of another; step 4 draws nothing.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
 
@@ -385,7 +386,7 @@ class RbExplore:
 
     def train_novelty(self, trajectories, rng):
         """Step 5: train RND on the states of the exploration trajectories only (S4-05). Returns its
-        loss; None where L is 0, because novelty then serves nothing."""
+        loss; None where L is 0, because nothing then uses novelty."""
         if self.config.L == 0:
             return None
         return self.novelty.fit([tau.frames for tau in trajectories], rng)
@@ -424,12 +425,12 @@ class State:
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state cannot be returned to and is not
-    stored (R10)."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). No step can be taken from a terminal state, so it is
+    not stored (R10)."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
-    actions: list[bytes]  # T; actions[t] lead from state t - 1 to t: several across blanks (R24)
+    actions: list[bytes]  # T; actions[t] lead from state t - 1 to t; several across blanks (R24)
     units: list[tuple | None]  # the coverage unit after each step: one entry per step taken
     terminated: bool
     truncated: bool
@@ -478,7 +479,7 @@ def roll_back(env, state):
 
 def pairs_within(frames, n, N, rng):
     """Figure 2 (a, b): for each state of a trajectory (T, H, W), one similar state and, if there is
-    any, one dissimilar state, each uniform among those of the same trajectory (R17)."""
+    any, one dissimilar state, each drawn uniformly from this trajectory (R17)."""
     pairs = []
     position = np.arange(len(frames))
     for i in range(len(frames)):
@@ -492,8 +493,8 @@ def pairs_within(frames, n, N, rng):
 
 
 def pairs_with_prefix(frames, full_prefix, N, rng):
-    """Figure 2 (c): for each state of a trajectory (T, H, W), one state of its full prefix, if
-    there is any, uniform among those more than N steps away along the joined path (S4.2-22,
+    """Figure 2 (c): for each state of a trajectory (T, H, W), one state of its full prefix, drawn
+    uniformly from those more than N before it on the joined path, if there are any (S4.2-22,
     S4.2-23, R16)."""
     pairs = []
     position = np.arange(len(full_prefix))
@@ -517,8 +518,8 @@ def balanced(pairs, rng):
 
 
 def in_either_order(pair, rng):
-    """The pair, or the pair with its states swapped: a fixed order would reveal the label, because
-    a prefix state would always be the second (R17)."""
+    """The pair, or with probability 1/2 its states swapped: otherwise a prefix state would always
+    come second, and its position would reveal the label (R17)."""
     s_1, s_2, y = pair
     return (s_2, s_1, y) if rng.random() < 0.5 else pair
 
@@ -583,8 +584,8 @@ class SimilarityModel(nn.Module):
 
     def fit(self, pairs, rng):
         """Minimise the binary cross-entropy in `epochs` passes (R19), each over a balanced draw of
-        its own. Returns the mean loss of the last pass; None, and leaves R unchanged, unless there
-        are pairs of both classes."""
+        its own. Returns the mean loss of the last pass. Without pairs of both classes, R is
+        unchanged and the result is None."""
         losses = []
         self.train()
         try:
@@ -652,8 +653,8 @@ class Graph:
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
         self.adjacent: dict[int, set[int]] = {0: set()}  # predecessors and successors (R8)
-        # One arc for each cluster but 0, and for its ancestors, merged or not. Merging changes no
-        # arc, so that every full prefix remains a path that was walked (R15).
+        # One arc for each living cluster but 0, and for its ancestors, merged or not. Merging
+        # changes no arc, so that every full prefix remains a path that was walked (R15).
         self.E_parent: dict[int, ParentArc] = {}
         self.next_number = 1  # of the next cluster; numbers are not reused
         self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the current R
@@ -862,9 +863,9 @@ class RND(nn.Module):
         return np.concatenate([self(part).cpu().numpy() for part in in_parts(frames)])
 
     def reward(self, frames):
-        """The intrinsic reward, frames (T, H, W) -> (T,): (error - mean) / standard deviation, over
-        the errors of the last five iterations' states, computed after training on them (R4). Before
-        the first training, nothing is novel (R6)."""
+        """The intrinsic reward, frames (T, H, W) -> (T,): (error - mean) / standard deviation. Mean
+        and standard deviation are those of the errors of the last five iterations' states, measured
+        after RND was trained on them (R4). Before the first training, nothing is novel (R6)."""
         if not self.recent_errors:
             return np.full(len(frames), -np.inf)
         recent = np.concatenate(self.recent_errors)
@@ -880,8 +881,8 @@ class RND(nn.Module):
         order = rng.permutation(len(states))
         for batch in progress(batches(order, self.batch_size), "train RND"):
             losses.append(self.update(np.stack([states[k] for k in batch])))
-        # After the training: before it, the large errors of one new room would widen the scale and
-        # hide the next new room (R4).
+        # Measured after the training. The errors before it are large in a new room; they would
+        # widen the scale and hide the next new room (R4).
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
 
@@ -939,7 +940,7 @@ class Coverage:
     def metrics(self):
         """Steps, visited units, and %Cov as a share; None where full coverage is unknown."""
         units = len(self.visited())
-        # At most 1, because the number of units of full coverage may be an estimate (S5-03).
+        # Cut at 1, because where `full` is an estimate, more units may be visited (S5-03).
         share = min(1.0, units / self.full) if self.full else None
         return {"steps": self.steps, "units": units, "coverage": share}
 
@@ -1516,12 +1517,12 @@ class Run:
         self.folder = pathlib.Path(os.path.expanduser(folder))
         self.algorithm = algorithm
         self.settings = {
+            **(settings or {}),
             "method": algorithm.method,
             "config": asdict(algorithm.config),
             "frame_shape": list(algorithm.initial_state.frame.shape),
             "full_coverage": algorithm.coverage.full,
             "unit_name": getattr(algorithm.env, "unit_name", "units"),
-            **(settings or {}),
         }
         self.stop_at_full = stop_at_full
         self.rows: list[dict] = []  # the metrics of each iteration
@@ -1640,6 +1641,7 @@ class Run:
         except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             raise damaged(self.folder, error) from None
         self.rows = state["rows"]
+        self.settings = state["settings"] | self.settings
 
 
 def check_unused(folder):
@@ -1677,8 +1679,10 @@ def read_checkpoint(folder: str | os.PathLike) -> dict:
             raise zipfile.BadZipFile(broken)
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
         return {name: state[name] for name in ("settings", "rows", "s_init", "algorithm")}
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"there is no run in {folder}: it has no checkpoint.pt") from None
+    except (OSError, MemoryError):
+        raise
     except Exception as error:  # zipfile and torch raise many kinds for a damaged file
         raise damaged(folder, error) from None
 
@@ -2156,7 +2160,7 @@ def table_row(label, runs):
         marks = [steps_to(run.coverage) for run in runs]
         row["at 100 %"] = f"{sum(mark[100] is not None for mark in marks)} of {len(runs)}"
         for percent in (50, 90, 100):
-            median = np.median([mark[percent] or math.inf for mark in marks])
+            median = np.median([math.inf if m[percent] is None else m[percent] for m in marks])
             row[f"to {percent} %"] = f"{median:,.0f}" if median < math.inf else "-"
     return row
 
@@ -2379,7 +2383,15 @@ def end_with_parent():
         multiprocessing.parent_process().join()
         os._exit(1)
 
+    def end_soon(number, frame):
+        timer = threading.Timer(5, os._exit, [1])
+        timer.daemon = True
+        timer.start()
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    # Slurm sends SIGTERM to the workers too. Of a worker that ended while it was sending a
+    # trajectory, the parent would wait for the rest for ever.
+    signal.signal(signal.SIGTERM, end_soon)
     threading.Thread(target=watch, daemon=True).start()
 
 
@@ -2420,8 +2432,9 @@ def show(run):
         text = f"{coverage.steps:,} steps, {seconds:.0f} s: {len(coverage.visited())} {name}"
         if coverage.full:
             share = coverage.metrics()["coverage"]
-            reached = [f"{mark} %: {s or 'not reached'}" for mark, s in steps_to(coverage).items()]
-            text += f" of {coverage.full}, {share:.1%}; steps to {', '.join(reached)}"
+            text += f" of {coverage.full}, {share:.1%}; steps to "
+            marks = steps_to(coverage).items()
+            text += ", ".join(f"{m} %: {'not reached' if s is None else s}" for m, s in marks)
         say(text)
 
 
@@ -2437,6 +2450,7 @@ HINTS = {  # what the user can do about an OSError
     errno.ENOSPC: "make room, or choose another --out",
     errno.EDQUOT: "make room, or choose another --out",
     errno.ENOLCK: "choose an --out on a file system that has locks",
+    errno.EPIPE: "the reader of the output has ended; the run can be resumed",
     None: "choose an --out that can be written",
 }
 
