@@ -1111,14 +1111,19 @@ def load_statistics(statistics, state):
 
 def progress(items, what, total=None):
     """A progress bar over a long loop; silent where stderr is not a terminal."""
+    disable = True if sys.stderr is None else None  # None: where it is not a terminal
+    return tqdm()(items, desc=what, total=total, leave=False, disable=disable)
+
+
+def tqdm():
+    """The class tqdm. Raises InputError where an invalid TQDM_ variable makes its import fail."""
     try:
-        from tqdm import tqdm
+        import tqdm
     except ValueError as error:
         raise InputError(
             f"an environment variable TQDM_... is invalid ({error}): correct it, or unset it"
         ) from None
-    disable = True if sys.stderr is None else None  # None: where it is not a terminal
-    return tqdm(items, desc=what, total=total, leave=False, disable=disable)
+    return tqdm.tqdm
 
 
 # ##################################################################################################
@@ -2442,7 +2447,7 @@ def say(text, file=None):
     """Print a line above the progress bars."""
     file = file or sys.stdout
     if file is not None:  # None: the process was started without it
-        progress(None, "").write(text, file=file)
+        tqdm().write(text, file=file)
         file.flush()
 
 

@@ -2628,6 +2628,12 @@ def test_S3_2_02_loading_a_state_costs_no_frame_of_the_emulator(emulator, monkey
     assert memory(env).hex() == before.hex()
 
 
+def test_S3_2_03_every_cluster_of_a_game_is_reached_exactly(emulator):
+    a = make_method("cells", emulator, replace(TINY, steps=500, M=3, trajectory_steps=30)).run()
+    assert len(a.graph.clusters) > 3
+    assert set(verify(a).values()) == {"exact"}
+
+
 def test_S5_01_an_observation_is_a_gray_picture_of_96_by_96(emulator):
     """5: "The input of the agent is a 96x96 grayscale image"."""
     env = emulator()
