@@ -3528,7 +3528,7 @@ def test_ctrl_c_says_how_to_resume_and_draws(cells, tmp_path, capsys, monkeypatc
 
     def interrupted(a, *arguments):
         if a.iteration == 3:
-            signal.raise_signal(signal.SIGINT)
+            raise KeyboardInterrupt  # as SIGINT does, unless the process ignores it
         return train_novelty(a, *arguments)
 
     with monkeypatch.context() as patch:
