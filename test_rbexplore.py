@@ -3777,6 +3777,14 @@ def test_a_time_limit_outside_the_snapshot_stops_the_run(tmp_path, workers):
     assert a.coverage.steps < 400
 
 
+def test_a_truncation_that_not_every_walk_from_s_init_meets_stops_no_run(tmp_path):
+    a = restarted()
+    cut = replace(tau([0, 1]), truncated=True)
+    a.walks = lambda states, seeds, limit: [tau([0, 1]), *[cut] * (len(states) - 1)]
+    with pytest.warns(UserWarning, match="ten trajectories in a row"):
+        Run(tmp_path, a).check_ends([cut] * 10)
+
+
 def test_the_hint_of_a_system_error_fits_it(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").touch()
     assert "; choose an --out that can be written" in refused(capsys, "--out", tmp_path / "file/x")
