@@ -1165,7 +1165,7 @@ def test_S4_2_25_merges_if_R_is_greater_than_theta_merge(theta, merged):
 
 
 @pytest.mark.parametrize("pretraining", [True, False])
-def test_S4_2_25_S6_1_13_theta_merge_is_a_parameter_of_its_own(pretraining):
+def test_S4_2_25_S6_1_13_S6_3_03_theta_merge_is_a_parameter_of_its_own(pretraining):
     for theta_merge, merged in ((0.6, {1: 0}), (0.75, {})):
         a = explorer(theta_merge=theta_merge, theta_sim=0.1)
         a.pretraining = pretraining
@@ -2315,6 +2315,13 @@ def test_S3_2_03_verify_finds_centres_that_their_actions_do_not_reach(actions):
     a.graph.E_parent[2] = replace(a.graph.E_parent[2], actions=actions)
     verdict = "the actions do not lead to the centre"
     assert list(verify(a, steps=0).values()) == ["exact"] * 2 + [verdict] * 3
+
+
+def test_S3_2_03_verify_compares_the_unit_that_is_reached(monkeypatch):
+    a = tracked()
+    monkeypatch.setattr(Track, "unit", lambda env: (env.place, env.counter > 0))
+    wrong = [v for v, verdict in verify(a).items() if verdict.startswith("the actions")]
+    assert wrong == [1, 2, 3, 4]
 
 
 def test_S3_2_03_verify_replays_a_prefix_that_clusters_share_once():
