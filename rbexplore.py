@@ -1,9 +1,10 @@
 """RbExplore, the algorithm of "Long-Term Exploration in Persistent MDPs" (Ugadiarov, Skrynnik,
 Panov, 2021).
 
-The agent explores without rewards. It rolls back to stored snapshots of the environment, clusters
-the states it visits by a learned similarity R, and starts again from rarely visited clusters. One
-iteration has five steps (section 4), which are the five calls in `RbExplore.iterate`:
+The agent explores without rewards. It clusters the states it visits by a learned similarity R,
+stores a snapshot with each cluster, and rolls the environment back to rarely visited clusters to
+explore from there. One iteration has five steps (section 4), which are the five calls in
+`RbExplore.iterate`:
 
     1  explore            sample M clusters of G, roll back to each, explore with pi_explore
     2  make_pairs         explore from at most L novel states; label pairs of states
@@ -15,23 +16,27 @@ iteration has five steps (section 4), which are the five calls in `RbExplore.ite
     s, snap             State.frame, .snapshot       a state: its observation, and the bytes that
                                                      restore it in the simulator
     tau                 Trajectory                   successive states s_1 ... s_T
-    pi_explore          walk                         uniform over the actions
+    pi_explore          in walk                      uniform over the actions
     R(s_1, s_2)         SimilarityModel              in [0, 1]: are the two states close in time?
     n, N                Config.n, Config.N           similar: fewer than n steps apart; dissimilar:
                                                      more than N
-    G = (V, E)          Graph.clusters, Graph.arcs   clusters, and arcs between them
-    v = (s, snap)       Cluster                      a centre and its snapshot; in the code, v is
-                                                     the number of the cluster
-    E_parent            Graph.E_parent               the arc from v to the cluster it came from
+    G = (V, E)          Graph.clusters, Graph.arcs   clusters, and directed arcs between them
+    v = (s, snap)       Cluster                      a cluster: its centre, a state, and how often
+                                                     it was visited; v, u: numbers of clusters
+    E_parent            Graph.E_parent               from a cluster to its parent, with the states
+                                                     on the way (the prefix)
     theta_sim           Config.theta_sim             a state joins a cluster if R > theta_sim
     theta_merge         Config.theta_merge           two clusters merge if R > theta_merge
-    B, beta, L          B, Config.beta, Config.L     novel states, their threshold, how many of them
-                                                     are sampled
+    B, beta, L          B, Config.beta, Config.L     the novel states, whose intrinsic reward is
+                                                     above beta; L of them are sampled
     M                   Config.M                     exploration trajectories per iteration
+    pi^p                Graph.actions_to             the actions that lead from s_init to a cluster
+    %Cov                Coverage                     the share of the level's units (for example
+                                                     tiles) that were visited; it counts the steps
 
+A step of the environment is one action, which an emulator repeats for `frameskip` frames (R1).
 "S4.2-03" is a statement of the paper; `pytest -k S4_2_03` runs its tests. "R13" is our reading of
-a passage where the paper is silent or unclear. The README lists both. A step is an agent step: one
-action, after the frameskip (R1).
+a passage where the paper is silent or unclear. The README lists both.
 """
 
 import argparse
@@ -84,8 +89,8 @@ def option(default, meaning, low=-math.inf, high=math.inf):
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's configuration, the same for every level. The defaults are the paper's values;
-    where it states none, they follow our readings.
+    """A configuration. The defaults are the paper's, the same for every level; where it states no
+    value, they follow our readings.
 
     Raises InputError for values that cannot work."""
 
@@ -94,13 +99,13 @@ class Config:
     pretrain_steps: int = option(500_000, "steps of pretraining, after which G is reset (6.1)", 0)
     M: int = option(30, "exploration trajectories per iteration (6.1)", 1)
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
-    L: int = option(1000, "most novel states to explore from per iteration (6.1)", 0)
+    L: int = option(1000, "most novel states to explore from per iteration (6.1); 0: no RND", 0)
     additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
     beta: float = option(2.5, "a state is novel above this intrinsic reward (6.1, R4)")
     n: int = option(5, "similar: states fewer than n steps apart (6.1)", 1)
     N: int = option(25, "dissimilar: states more than N steps apart (6.1)", 1)
     prefix: bool = option(True, "negative pairs with the full prefix (4.2; off: ablation of 6.3)")
-    epochs: int = option(4, "passes of R over balanced pairs of an iteration (R19)", 1)
+    epochs: int = option(4, "training passes over the pairs of an iteration (R19)", 1)
     theta_sim: float = option(0.5, "a state joins a cluster if R is above this (6.1)", 0, 1)
     theta_merge: float = option(0.5, "two clusters merge if R is above this (6.1)", 0, 1)
     merge: bool = option(True, "merge clusters (4.2; off: ablation of 6.3)")
@@ -108,10 +113,10 @@ class Config:
     frameskip: int = option(4, "frames of the emulator per step (6.1)", 1, 1000)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
     small_networks: bool = option(
-        False, "small encoders instead of ResNet-18 for R (6.1) and Burda et al.'s for RND"
+        False, "small encoders (R: instead of ResNet-18, 6.1; RND: of Burda et al.'s)"
     )
     embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
-    head_width: int = option(512, "width of fully connected layers (not in the paper)", 1)
+    head_width: int = option(512, "width of R's fully connected layers (not in the paper)", 1)
     learning_rate: float = option(1e-4, "learning rate of Adam (R18)", 0)
     r_batch: int = option(256, "pairs per batch of R (R18)", 2)
     rnd_batch: int = option(256, "states per batch of RND (R18)", 1)
@@ -143,15 +148,15 @@ def check_field(f, value):
     """Raise InputError unless the value has the type and range of the field."""
     low = f.metadata["low"]
     high = f.metadata["high"]
-    whole_number_for_float = f.type is float and type(value) is int
+    whole_number_for_float = f.type is float and type(value) is int  # but not a bool
     if type(value) is not f.type and not whole_number_for_float:
         raise InputError(f"{f.name} is {value!r}: it must be of type {f.type.__name__}")
     if not low <= value <= high:
         raise InputError(f"{f.name} is {value}: choose a number from {low:,} to {high:,}")
 
 
-# For small images, a small budget and a CPU. What is not listed is as in the paper. n and N: a step
-# of the maze is a whole tile (R30).
+# For small images, a small budget and a CPU. What is not listed is as in the paper. n and N are
+# smaller, because a step of the maze crosses a whole tile (R30).
 MAZE = Config(
     steps=100_000,
     pretrain_steps=4_000,
@@ -194,17 +199,17 @@ CONFIGS = {"paper": Config(), "maze": MAZE, "small": SMALL}
 @dataclass
 class Iteration:
     """The result of one iteration. starts, trajectories, clusters and, unless L is 0, novelty have
-    one entry per exploration trajectory, in the same order. An agent's iteration has metrics
+    one entry per exploration trajectory, in the same order. The compared methods fill in metrics
     only."""
 
     metrics: dict
     starts: list[int] = field(default_factory=list)  # step 1: the sampled clusters
     trajectories: list["Trajectory"] = field(default_factory=list)  # step 1
-    novelty: list[np.ndarray] = field(default_factory=list)  # step 2: of each state, (T,)
+    novelty: list[np.ndarray] = field(default_factory=list)  # step 2: intrinsic rewards, (T,)
     additional: list["Trajectory"] = field(default_factory=list)  # step 2
-    pairs: list[tuple] = field(default_factory=list)  # step 2: triples (s_1, s_2, y)
+    pairs: list[tuple] = field(default_factory=list)  # step 2: labelled pairs (s_1, s_2, y)
     clusters: list[list[int]] = field(default_factory=list)  # step 4: of each state, before merging
-    merged: dict[int, int] = field(default_factory=dict)  # step 4: cluster -> its survivor
+    merged: dict[int, int] = field(default_factory=dict)  # step 4: {absorbed: survivor}
 
 
 class RbExplore:
@@ -212,11 +217,11 @@ class RbExplore:
 
     env_fn: makes the persistent environment (see envs.PersistentEnv).
     device: where the networks are.
-    executor: a pool of processes that walks the trajectories, with the same result (see
-    envs.Workers); it needs an env_fn that can be pickled.
+    executor: a pool of processes that walks the trajectories (see envs.Workers). The result is the
+    same as without it; env_fn must be picklable.
 
-    Raises InputError for an environment that breaks the contract, and for a loss that is not
-    finite."""
+    Raises InputError for an environment that breaks the contract of PersistentEnv, and for a loss
+    that is not finite."""
 
     method = "rbexplore"
 
@@ -232,10 +237,11 @@ class RbExplore:
         frame, _ = self.env.reset(seed=self.config.seed)
         self.initial_state = State(np.array(frame), self.env.snapshot())
         self.initial_unit = unit_key(self.env.unit())
-        # Layers draw their first weights from torch's global generator, which is restored.
+        # PyTorch draws default weights from its global generator, which fork_rng leaves untouched
+        # for the caller; `initialise` replaces them.
         with torch.random.fork_rng(devices=[]):
             self.similarity = SimilarityModel(self.config, frame.shape, device)
-            self.novelty = RND(self.config, frame.shape, device)
+            self.rnd = RND(self.config, frame.shape, device)
         self.graph = Graph(self.initial_state)
         full_coverage = getattr(self.env, "full_coverage", None)
         self.coverage = Coverage(full_coverage, self.config.steps)
@@ -244,17 +250,18 @@ class RbExplore:
         self.workers = None
         if executor is not None:
             self.workers = Workers(executor, env_fn, self.config.seed)
-            self.workers.check(walk, self.initial_state, 0, 0)
+            self.workers.check(walk, self.initial_state, 0, 0)  # a walk of no steps
 
     def iterate(self) -> Iteration:
         """Run one iteration: the five steps, in the paper's order."""
         if self.pretraining and self.coverage.steps >= self.config.pretrain_steps:
             self.restart()
         self.iteration += 1
-        theta_sim = self.theta_sim_now()
+        theta_sim = self.theta_sim_now()  # from the steps before this iteration (R21)
         clusters_before = len(self.graph.clusters)
-        # A new generator per iteration keeps random states out of checkpoints. One generator per
-        # step keeps the draws of one step from shifting those of another; step 4 draws nothing.
+        # A new generator for each iteration, so that a checkpoint need not store any; and one for
+        # each of the five steps, so that the draws of one do not shift those of another. Step 4
+        # draws nothing.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
 
@@ -278,24 +285,33 @@ class RbExplore:
             "rnd_loss": rnd_loss,
         }
         return Iteration(
-            metrics, starts, trajectories, novelty, additional, pairs, clusters, merged
+            metrics=metrics,
+            starts=starts,
+            trajectories=trajectories,
+            novelty=novelty,
+            additional=additional,
+            pairs=pairs,
+            clusters=clusters,
+            merged=merged,
         )
 
     def run(self) -> "RbExplore":
-        """Iterate until the budget of steps is spent. Returns the algorithm itself."""
+        """Iterate until the steps of the budget are spent. Returns the algorithm itself."""
         while self.coverage.steps < self.config.steps:
             self.iterate()
         return self
 
     def restart(self):
         """End pretraining (6.1; S6.1-15): reset G to the initial state and start counting coverage
-        (R2). R, RND, their optimisers and the count of iterations are kept (R6, R31)."""
+        (R2). R, RND with its statistics, the optimisers and the counts of steps and iterations are
+        kept (R6, R31)."""
         self.pretraining = False
         self.graph = Graph(self.initial_state)
         self.coverage.visit(self.initial_unit)
 
     def theta_sim_now(self):
-        """theta_sim; during pretraining it rises linearly from 0 (6.1, R21; S6.1-13)."""
+        """theta_sim. During pretraining it rises linearly from 0 with the steps taken (6.1, R21;
+        S6.1-13)."""
         if not self.pretraining:
             return self.config.theta_sim
         return self.config.theta_sim * self.coverage.steps / self.config.pretrain_steps
@@ -303,37 +319,37 @@ class RbExplore:
     def explore(self, rng):
         """Step 1: sample M clusters, roll back to each, explore (S4-01, S6.1-06, S6.1-11). Returns
         the numbers of the sampled clusters, and a trajectory from each."""
-        clusters, probabilities = self.graph.sampling_distribution()
+        numbers, probabilities = self.graph.sampling_distribution()
         # With replacement, because G starts with a single cluster (R12).
-        starts = rng.choice(clusters, size=self.config.M, p=probabilities).tolist()
+        starts = rng.choice(numbers, size=self.config.M, p=probabilities).tolist()
         centres = [self.graph.clusters[v] for v in starts]
-        covers = not self.pretraining
-        trajectories = self.collect(centres, self.config.trajectory_steps, covers, rng)
+        max_steps = self.config.trajectory_steps
+        trajectories = self.collect(centres, max_steps, rng, covers=not self.pretraining)
         return starts, trajectories
 
-    def collect(self, states, max_steps, covers, rng):
+    def collect(self, states, max_steps, rng, covers):
         """Roll back to each state and walk at most `max_steps` steps. Every step counts (R2);
         `covers` says whether the units visited count as coverage (R25). Returns the
         trajectories."""
         seeds = rng.integers(2**63, size=len(states)).tolist()
-        trajectories = list(progress(self.walks(states, seeds, max_steps), "walk", len(states)))
+        trajectories = list(self.walks(states, seeds, max_steps))
         for tau in trajectories:
             for unit in tau.units:
                 self.coverage.count(unit, covers)
         return trajectories
 
     def walks(self, states, seeds, max_steps):
-        """A walk from each state, made here or by the workers. Yields trajectories."""
+        """A walk from each state, in this process or by the workers. Yields trajectories."""
         limits = [max_steps] * len(states)
         if self.workers is None:
             return map(functools.partial(walk, self.env), states, seeds, limits)
         return self.workers.map(walk, states, seeds, limits)
 
     def make_pairs(self, starts, trajectories, rng):
-        """Step 2: label pairs of exploration and of additional trajectories (S4-02), and pairs of
-        exploration trajectories with the full prefixes of their start clusters (S4.1-09, R29).
-        Returns the pairs, the additional trajectories, and the novelty of each exploration
-        trajectory's states."""
+        """Step 2: label pairs of states within each exploration and each additional trajectory
+        (S4-02), and pairs of a state of an exploration trajectory with one of the full prefix, the
+        states on the way from s_init to the start cluster (S4.1-09, R29). Returns the pairs, the
+        additional trajectories, and the intrinsic rewards of the exploration trajectories."""
         additional, novelty = self.explore_from_novel_states(trajectories, rng)
         pairs = []
         for tau in trajectories + additional:
@@ -349,33 +365,33 @@ class RbExplore:
     def explore_from_novel_states(self, trajectories, rng):
         """Put all novel states into B, sample L of them, and explore from those (S4.2-15 ...
         S4.2-18). B holds the novel states of this iteration only (R5). Returns the additional
-        trajectories, and the novelty of each exploration trajectory's states."""
+        trajectories, and the intrinsic rewards of the exploration trajectories."""
         if self.config.L == 0:
             return [], []
-        novelty = [self.novelty.reward(tau.frames) for tau in trajectories]
+        novelty = [self.rnd.reward(tau.frames) for tau in trajectories]
         B = []
         for tau, reward in zip(trajectories, novelty, strict=True):
             for i in np.flatnonzero(reward > self.config.beta):
                 B.append(State(tau.frames[i], tau.snapshots[i]))
         sample = [B[k] for k in rng.permutation(len(B))[: self.config.L]]
-        additional = self.collect(sample, self.config.additional_steps, False, rng)
+        additional = self.collect(sample, self.config.additional_steps, rng, covers=False)
         return additional, novelty
 
     def train_similarity(self, pairs, rng):
-        """Step 3: train R on the pairs of this iteration only (S4-03, S4-06). Returns its loss, and
-        its accuracy on these pairs before the training."""
-        # The diagnostic has a generator of its own, so that it does not shift what R draws.
+        """Step 3: train R on the pairs of this iteration only (S4-03, S4-06). Returns metrics: R's
+        true positive and true negative rates before the training, and its loss."""
+        # The rates have a generator of their own, so that they do not shift what R draws.
         true_positive_rate, true_negative_rate = self.similarity.rates(pairs, rng.spawn(1)[0])
         loss = self.similarity.fit(pairs, rng)
         return {"r_tpr": true_positive_rate, "r_tnr": true_negative_rate, "r_loss": loss}
 
     def update_graph(self, starts, trajectories, theta_sim):
-        """Step 4: add the states of the exploration trajectories to G; every 15th iteration, merge
-        (S4-04, S6.1-10, S6.3-01). Returns the cluster of each state of each trajectory, and which
-        cluster merged into which."""
+        """Step 4: add the states of the exploration trajectories to G; every merge_every-th (15th)
+        iteration, merge (S4-04, S6.1-10, S6.3-01). Returns the cluster of each state of each
+        trajectory, and {absorbed: survivor}."""
         self.graph.embed_centres(self.similarity)  # by the R just trained (S4-03)
         clusters = []
-        for start, tau in zip(starts, progress(trajectories, "update G"), strict=True):
+        for start, tau in zip(starts, trajectories, strict=True):
             clusters.append(self.graph.add_trajectory(start, tau, self.similarity, theta_sim))
         merged = {}
         if self.config.merge and self.iteration % self.config.merge_every == 0:
@@ -384,29 +400,29 @@ class RbExplore:
 
     def train_novelty(self, trajectories, rng):
         """Step 5: train RND on the states of the exploration trajectories only (S4-05). Returns its
-        loss; None where L is 0, because nothing then uses novelty."""
+        loss; None if L is 0, because then nothing uses novelty."""
         if self.config.L == 0:
             return None
-        return self.novelty.fit([tau.frames for tau in trajectories], rng)
+        return self.rnd.fit([tau.frames for tau in trajectories], rng)
 
     def state_dict(self) -> dict:
-        """The complete state of the algorithm, as plain data and tensors."""
+        """What load_state_dict needs to continue, as plain data and tensors."""
         return {
             "pretraining": self.pretraining,
             "iteration": self.iteration,
             "coverage": self.coverage.state_dict(),
             "similarity": self.similarity.state_dict(),
-            "novelty": self.novelty.state_dict(),
+            "rnd": self.rnd.state_dict(),
             "graph": self.graph.state_dict(),
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """Restore the state of an algorithm of the same configuration and environment."""
+        """Continue from the state of an algorithm with the same configuration and environment."""
         self.pretraining = state["pretraining"]
         self.iteration = state["iteration"]
         self.coverage.load_state_dict(state["coverage"])
         self.similarity.load_state_dict(state["similarity"])
-        self.novelty.load_state_dict(state["novelty"])
+        self.rnd.load_state_dict(state["rnd"])
         self.graph.load_state_dict(state["graph"])
 
 
@@ -424,11 +440,11 @@ class State:
 @dataclass
 class Trajectory:
     """tau = (s_1, snap_1), ..., (s_T, snap_T). No step can be taken from a terminal state, so it is
-    not stored (R10)."""
+    not stored (R10); the last state of a truncated episode is."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
-    actions: list[bytes]  # T; actions[t] lead from state t - 1 to t; several across blanks (R24)
+    actions: list[bytes]  # T; actions[t] lead from state t - 1 to state t, one byte per action
     units: list[tuple | None]  # the coverage unit after each step: one entry per step taken
     terminated: bool
     truncated: bool
@@ -451,7 +467,7 @@ def walk(env: PersistentEnv, start: State, seed: int, max_steps: int) -> Traject
         frame, _, terminated, truncated, info = env.step(int(env.action_space.start) + action)
         units.append(unit_key(env.unit()))
         since_state += bytes([action])
-        blank = info.get("blank", False)  # a transition screen counts as a step, not a state (R24)
+        blank = info.get("blank", False)  # a blank screen counts as a step, not as a state (R24)
         if not terminated and not blank:
             frames.append(np.array(frame))
             snapshots.append(env.snapshot())
@@ -461,23 +477,24 @@ def walk(env: PersistentEnv, start: State, seed: int, max_steps: int) -> Traject
 
 
 def roll_back(env, state):
-    """Return to a state without an environment step (S3.2-02). Raises InputError if the environment
-    shows another frame (S4-01)."""
+    """Return to a state without an environment step (S3.2-02). Raises InputError if the frame
+    differs from the stored one (S4-01)."""
     if not np.array_equal(env.restore(state.snapshot), state.frame):
         raise InputError(
-            "restore() returned a different frame from the one stored with the snapshot: part of "
-            "the state is not in the snapshot; see PersistentEnv in envs.py"
+            "restore() returned a different frame from the one stored with the snapshot: probably, "
+            "part of the state is not in the snapshot; see PersistentEnv in envs.py"
         )
 
 
 # ------------------------------------------ step 2: training pairs (4.1, 4.2; S4.1-02 ... S4.1-09)
 
-# A pair is a triple (s_1, s_2, y): two frames, and y = 1 if they are similar (S4.1-07).
+# A pair is a triple (s_1, s_2, y): two frames, and y = 1 if they are similar, else 0 (S4.1-07).
+# Distances count the states of a trajectory, which are one step apart except across blank screens.
 
 
 def pairs_within(frames, n, N, rng):
-    """Figure 2 (a, b): for each state of a trajectory (T, H, W), one similar state and, if there is
-    any, one dissimilar state, each drawn uniformly from this trajectory (R17)."""
+    """Figure 2 (a, b): for each state of a trajectory (T, H, W), one similar state and, if one
+    exists, one dissimilar state, each drawn uniformly from this trajectory (R17)."""
     pairs = []
     position = np.arange(len(frames))
     for i in range(len(frames)):
@@ -492,12 +509,12 @@ def pairs_within(frames, n, N, rng):
 
 def pairs_with_prefix(frames, full_prefix, N, rng):
     """Figure 2 (c): for each state of a trajectory (T, H, W), one state of its full prefix, drawn
-    uniformly from those more than N before it on the joined path, if there are any (S4.2-22,
-    S4.2-23, R16)."""
+    uniformly from those more than N before it, if one exists. Distances are measured along the
+    joined path, which is the prefix followed by the trajectory (S4.2-22, S4.2-23, R16)."""
     pairs = []
     position = np.arange(len(full_prefix))
     for i in range(len(frames)):
-        # The last state of the prefix is s_1, the first of the trajectory.
+        # full_prefix[-1] and frames[0] are the same state.
         distance = (len(full_prefix) - 1 + i) - position
         distant = np.flatnonzero(distance > N)
         if len(distant) > 0:
@@ -506,7 +523,7 @@ def pairs_with_prefix(frames, full_prefix, N, rng):
 
 
 def balanced(pairs, rng):
-    """Equally many similar and dissimilar pairs, drawn anew at each call, in random order (R17)."""
+    """Equally many similar and dissimilar pairs, in random order (R17)."""
     similar = [pair for pair in pairs if pair[2] == 1]
     dissimilar = [pair for pair in pairs if pair[2] == 0]
     size = min(len(similar), len(dissimilar))
@@ -523,7 +540,7 @@ def in_either_order(pair, rng):
 
 
 def stack_pairs(pairs):
-    """Frames s_1 (B, H, W), frames s_2 (B, H, W), labels (B,)."""
+    """Three arrays: the frames s_1, the frames s_2, (batch, H, W) each, and the labels (batch,)."""
     s_1, s_2, y = zip(*pairs, strict=True)
     return np.stack(s_1), np.stack(s_2), np.array(y)
 
@@ -532,9 +549,9 @@ def stack_pairs(pairs):
 
 
 class SimilarityModel(nn.Module):
-    """R_w(s_1, s_2): one encoder embeds both frames; four fully connected layers classify the two
-    embeddings (6.1). The model is in evaluation mode except during `fit`, so that R of a pair
-    depends on that pair alone (S4.1-01).
+    """R(s_1, s_2): one encoder embeds both frames; four fully connected layers classify the two
+    embeddings (6.1). Except during `fit`, the model is in evaluation mode: batch normalisation then
+    uses fixed statistics, so that R of a pair depends on that pair alone (S4.1-01).
 
     shape: of a frame, (H, W) or (H, W, C)."""
 
@@ -555,18 +572,18 @@ class SimilarityModel(nn.Module):
             *dense(width, 1),
         )
         initialise(self, config.seed, 0)
-        self.to(device, memory_format=torch.channels_last)  # the faster layout
+        self.to(device, memory_format=torch.channels_last)  # for speed only, as is `fused`
         self.eval()
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate, fused=True)
 
     def forward(self, s_1, s_2):
-        """Two batches of frames (B, H, W) -> logits of R (B,)."""
-        frames = to_input(np.concatenate([s_1, s_2]), self.device)  # (2B, C, H, W)
-        e_1, e_2 = self.encoder(frames).chunk(2)  # (B, d) each
+        """Two batches of frames (batch, H, W) -> logits of R (batch,)."""
+        frames = to_input(np.concatenate([s_1, s_2]), self.device)  # (2 * batch, C, H, W)
+        e_1, e_2 = self.encoder(frames).chunk(2)  # (batch, d) each
         return self.logits(e_1, e_2)
 
     def logits(self, e_1, e_2):
-        """Two batches of embeddings (B, d) -> logits of R (B,)."""
+        """Two batches of embeddings (batch, d) -> logits of R (batch,)."""
         return self.head(torch.cat([e_1, e_2], dim=1)).squeeze(1)
 
     @torch.no_grad()
@@ -577,36 +594,36 @@ class SimilarityModel(nn.Module):
 
     @torch.no_grad()
     def score(self, e_1, e_2):
-        """R of embeddings (K, d) and others, (K, d) or a single one (d,) -> (K,) in [0, 1]."""
+        """R of each embedding in e_1 (K, d) with the corresponding one in e_2 (K, d), or with the
+        single e_2 (d,) -> (K,) in [0, 1]."""
         return torch.sigmoid(self.logits(e_1, e_2.expand_as(e_1))).cpu().numpy()
 
     def fit(self, pairs, rng):
-        """Minimise the binary cross-entropy in `epochs` passes (R19), each over a balanced draw of
-        its own. Returns the mean loss of the last pass. Without pairs of both classes, R is
-        unchanged and the result is None."""
-        losses = []
+        """Minimise the binary cross-entropy in `epochs` passes (R19), each over a new balanced draw
+        of the pairs. Returns the mean loss of the last pass. Without pairs of both classes there
+        are no batches: R is unchanged and the result is None."""
         self.train()
         try:
             for _ in range(self.epochs):
                 losses = []
-                for batch in progress(batches(balanced(pairs, rng), self.batch_size), "train R"):
+                for batch in batches(balanced(pairs, rng), self.batch_size):
                     losses.append(self.update(*stack_pairs(batch)))
         finally:
-            self.eval()  # also after an interruption
+            self.eval()  # also after Ctrl-C
         return float(np.mean(losses)) if losses else None
 
     def update(self, s_1, s_2, y):
-        """One optimiser step on frames (B, H, W) twice and labels (B,). Returns the loss before it,
-        the mean of -y log R - (1 - y) log(1 - R) (S4.1-08)."""
+        """One optimiser step on a batch (see stack_pairs). Returns the loss before it, the mean of
+        -y log R - (1 - y) log(1 - R) (S4.1-08)."""
         labels = torch.from_numpy(y).float().to(self.device)
         loss = F.binary_cross_entropy_with_logits(self(s_1, s_2), labels)
         gradient_step(self.optimiser, loss, "R", max_norm=1.0)  # R18
         return loss.item()
 
     def rates(self, pairs, rng):
-        """The true positive and true negative rates of R > 0.5, over at most 1,000 pairs whose
-        frames differ: identical frames are similar by construction, and would hide whether R
-        generalises. None, None unless there are such pairs of both classes."""
+        """The true positive and true negative rates of R > 0.5, over a balanced sample of at most
+        1,000 pairs whose frames differ: pairs of identical frames do not show whether R
+        generalises. (None, None) without such pairs of both classes."""
         differing = [pair for pair in pairs if not np.array_equal(pair[0], pair[1])]
         chosen = balanced(differing, rng)[:1000]
         if not chosen:
@@ -616,7 +633,7 @@ class SimilarityModel(nn.Module):
         return float(np.mean(R[y == 1] > 0.5)), float(np.mean(R[y == 0] <= 0.5))
 
     def get_extra_state(self):
-        """What PyTorch's state_dict() stores beside the weights."""
+        """What PyTorch's state_dict() stores in addition to the weights."""
         return self.optimiser.state_dict()
 
     def set_extra_state(self, state):
@@ -628,38 +645,40 @@ class SimilarityModel(nn.Module):
 
 @dataclass
 class Cluster(State):
-    """v = (s, snap): the centre of a cluster, and its visits."""
+    """v = (s, snap): a cluster, which is its centre and the number of its visits."""
 
-    visits: int = 1  # states assigned to the cluster; the first is its centre (R11)
+    visits: int = 1  # states assigned to it, its centre and every start included (R11)
 
 
 @dataclass(frozen=True)
 class ParentArc:
-    """An arc of E_parent from a cluster to its parent, with the stored prefix."""
+    """An arc of E_parent, from a cluster to its parent: the cluster last created on the same
+    trajectory, or the start cluster if there was none (R13)."""
 
     parent: int
     prefix: np.ndarray  # (k, H, W), from the parent's centre to the cluster's, both included
-    actions: bytes  # the actions that lead from the one to the other, counted from 0
+    actions: bytes  # those that lead from the parent's centre to the cluster's
 
 
 class Graph:
     """G. Clusters are numbered in the order of their creation; number 0 is the initial cluster
-    (S4.2-11). Below, v, u, later and earlier are such numbers."""
+    (S4.2-11). Below, v, u, start, parent, later and earlier are such numbers."""
 
     def __init__(self, initial_state: State):
         initial = Cluster(initial_state.frame, initial_state.snapshot)
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
         self.adjacent: dict[int, set[int]] = {0: set()}  # predecessors and successors (R8)
-        # One arc for each living cluster but 0, and for its ancestors, merged or not. Merging
-        # changes no arc, so that every full prefix remains a path that was walked (R15).
+        # One arc for each cluster of G but 0, and for its ancestors, merged or not. Merging never
+        # changes an arc of E_parent, so that every full prefix remains a path that was walked; it
+        # drops those that no cluster of G needs (R15).
         self.E_parent: dict[int, ParentArc] = {}
         self.next_number = 1  # of the next cluster; numbers are not reused
         self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the current R
 
     def sampling_distribution(self):
-        """sigma: the clusters, and for each a probability inversely proportional to its visits
-        (6.1; S4.2-12)."""
+        """sigma: the numbers of the clusters, and their probabilities, inversely proportional to
+        their visits (6.1; S4.2-12)."""
         weights = np.array([1 / cluster.visits for cluster in self.clusters.values()])
         return list(self.clusters), weights / weights.sum()
 
@@ -669,8 +688,8 @@ class Graph:
         self.embeddings = dict(zip(self.clusters, similarity.embed(frames), strict=True))
 
     def most_similar(self, candidates, e_i, similarity, theta):
-        """Among these clusters, the one whose centre s has the greatest R(s, s_i), if that is above
-        theta; else None (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
+        """Of these clusters, the one whose centre s has the greatest R(s, s_i), if that is greater
+        than theta; else None (S4.2-03, S4.2-04). e_i: the embedding (d,) of s_i."""
         centres = torch.stack([self.embeddings[v] for v in candidates])  # (K, d)
         scores = similarity.score(centres, e_i)  # (K,)
         best = int(scores.argmax())
@@ -683,9 +702,7 @@ class Graph:
         embeddings = similarity.embed(tau.frames)  # (T, d)
         clusters = [start]  # the first state is the centre of its start cluster (R9)
         self.clusters[start].visits += 1
-        # The parent of a new cluster is the cluster last created on this trajectory, else its start
-        # (R13).
-        parent = start
+        parent = start  # of the next new cluster (R13)
         parent_index = 0  # of the parent's centre in tau
         for i in range(1, len(tau.frames)):
             previous = clusters[-1]
@@ -717,7 +734,7 @@ class Graph:
 
     def create(self, snapshot, arc, embedding):
         """Create a cluster whose centre is the last state of the arc's prefix, and add the arc to
-        E_parent (S4.2-01, S4.2-19, S4.2-20). Returns its number."""
+        E_parent (S4.2-01, S4.2-19, S4.2-20). Returns the number of the cluster."""
         v = self.next_number
         self.next_number += 1
         self.clusters[v] = Cluster(arc.prefix[-1], snapshot)
@@ -726,11 +743,11 @@ class Graph:
         self.E_parent[v] = arc
         return v
 
-    def add_arc(self, start, end, visits):
-        """Add the arc (start, end), or visits to it (S4.2-10)."""
-        self.arcs[start, end] = self.arcs.get((start, end), 0) + visits
-        self.adjacent[start].add(end)
-        self.adjacent[end].add(start)
+    def add_arc(self, source, target, visits):
+        """Add visits to the arc (source, target), and the arc if it is new (S4.2-10)."""
+        self.arcs[source, target] = self.arcs.get((source, target), 0) + visits
+        self.adjacent[source].add(target)
+        self.adjacent[target].add(source)
 
     def lineage(self, v):
         """v and its ancestors except the initial cluster, oldest first (S4.2-19)."""
@@ -741,7 +758,7 @@ class Graph:
         return line[::-1]
 
     def full_prefix(self, v: int) -> list[np.ndarray]:
-        """The frames from s_init to the centre of v in the order of time; empty for the initial
+        """The frames from s_init to the centre of v in chronological order; empty for the initial
         cluster (S4.2-21)."""
         if v == 0:
             return []
@@ -751,8 +768,8 @@ class Graph:
         return frames
 
     def actions_to(self, v: int) -> bytes:
-        """The actions that lead from s_init to the centre of v, counted from 0: pi^p of section 3.2
-        (S3.2-03)."""
+        """pi^p of section 3.2: the actions that lead from s_init to the centre of v (S3.2-03). They
+        are numbers from 0, whatever the first action of the action space is."""
         return b"".join(self.E_parent[u].actions for u in self.lineage(v))
 
     def merge(self, similarity, theta_merge):
@@ -761,7 +778,7 @@ class Graph:
         S4.2-25). A cluster that was absorbed is not compared again (R14). The earlier cluster keeps
         its centre (S4.2-28) and inherits visits (S4.2-27) and arcs. Returns {later: earlier}."""
         merged = {}
-        survivors = [0]
+        survivors = [0]  # the initial cluster is the earliest
         for later in list(self.clusters)[1:]:
             earlier = self.most_similar(survivors, self.embeddings[later], similarity, theta_merge)
             if earlier is None:
@@ -772,7 +789,7 @@ class Graph:
             absorbed = self.clusters.pop(later)
             self.clusters[earlier].visits += absorbed.visits
         self.set_arcs(self.arcs, merged)
-        # Keep the arcs of E_parent that lead from living clusters to s_init (R15; S4.2-29).
+        # Keep the arcs of E_parent that lead from clusters of G to s_init (R15; S4.2-29).
         needed = {u for v in self.clusters for u in self.lineage(v)}
         self.E_parent = {v: arc for v, arc in self.E_parent.items() if v in needed}
         return merged
@@ -782,11 +799,11 @@ class Graph:
         self-loops (S4.2-26)."""
         self.arcs = {}
         self.adjacent = {v: set() for v in self.clusters}
-        for (start, end), visits in arcs.items():
-            start = merged.get(start, start)
-            end = merged.get(end, end)
-            if start != end:
-                self.add_arc(start, end, visits)
+        for (source, target), visits in arcs.items():
+            source = merged.get(source, source)
+            target = merged.get(target, target)
+            if source != target:
+                self.add_arc(source, target, visits)
 
     def state_dict(self):
         """G without its embeddings, which every iteration computes anew. Frames are stored as
@@ -815,7 +832,7 @@ class Graph:
         self.set_arcs(state["arcs"], merged={})
 
 
-# ------------------------------------------------------- step 5: novelty (4.2; S4.2-14, S6.1-14)
+# ------------------------------------------- steps 2 and 5: novelty (4.2; S4.2-14, S6.1-14)
 
 
 class RND(nn.Module):
@@ -844,15 +861,15 @@ class RND(nn.Module):
         self.optimiser = torch.optim.Adam(
             self.predictor.parameters(), lr=config.learning_rate, fused=True
         )
-        self.pixels = RunningMeanStd(shape=shape)  # over all states trained on
-        self.recent_errors = deque(maxlen=5)  # one entry per iteration (R4); empty: untrained
+        self.pixels = RunningMeanStd(shape=shape)  # of each pixel, over all states trained on
+        self.recent_errors = deque(maxlen=5)  # one array per iteration (R4); empty: untrained
 
     def forward(self, frames):
-        """Frames (B, H, W) -> mean squared errors of the predictor (B,), on observations
+        """Frames (batch, H, W) -> mean squared errors of the predictor (batch,), on observations
         standardised and clipped to +-5 (R4)."""
         z = (frames - self.pixels.mean) / np.sqrt(self.pixels.var + 1e-8)
         z = z.clip(-5, 5).astype(np.float32)
-        x = channels_first(torch.from_numpy(z).to(self.device))  # (B, C, H, W)
+        x = channels_first(torch.from_numpy(z).to(self.device))  # (batch, C, H, W)
         return (self.predictor(x) - self.target(x)).square().mean(1)
 
     @torch.no_grad()
@@ -877,21 +894,21 @@ class RND(nn.Module):
         states = [frame for frames in trajectories for frame in frames]
         losses = []
         order = rng.permutation(len(states))
-        for batch in progress(batches(order, self.batch_size), "train RND"):
+        for batch in batches(order, self.batch_size):
             losses.append(self.update(np.stack([states[k] for k in batch])))
-        # Measured after the training. The errors before it are large in a new room; they would
-        # widen the scale and hide the next new room (R4).
+        # Measured after the training: the errors of new states before it are so large that they
+        # would widen the scale and hide the next new states (R4).
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
 
     def update(self, frames):
-        """One optimiser step on frames (B, H, W). Returns the mean error before it."""
+        """One optimiser step on frames (batch, H, W). Returns the mean error before it."""
         loss = self(frames).mean()
         gradient_step(self.optimiser, loss, "RND")
         return loss.item()
 
     def get_extra_state(self):
-        """What PyTorch's state_dict() stores beside the weights."""
+        """What PyTorch's state_dict() stores in addition to the weights."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "pixels": statistics_state(self.pixels),
@@ -909,9 +926,10 @@ class RND(nn.Module):
 
 
 class Coverage:
-    """The number of steps taken, and the units of coverage visited. All methods count here.
+    """The number of steps taken, and the units of coverage visited: pieces of the level, such as
+    tiles, that the environment names (unit()). The compared methods count in the same way.
 
-    full: units of full coverage, None if unknown. budget: the steps of the run."""
+    full: number of units of full coverage, None if unknown. budget: the steps of the run."""
 
     def __init__(self, full: int | None, budget: int):
         self.full = full
@@ -920,25 +938,27 @@ class Coverage:
         self.first_visits: dict[tuple, int] = {}  # unit -> step of its first visit
 
     def count(self, unit, covers=True):
-        """Count one step, after which the agent is in `unit`; covers: whether to mark it."""
+        """Count one step, after which the agent is in `unit`. covers: whether that counts as a
+        visit."""
         self.steps += 1
         if covers:
             self.visit(unit)
 
     def visit(self, unit):
-        """Mark a unit as visited; None is no unit."""
+        """Mark a unit as visited. None: the agent is in no unit."""
         if unit is not None:
             self.first_visits.setdefault(unit, self.steps)
 
     def visited(self) -> dict[tuple, int]:
-        """unit -> step of its first visit. The last iteration is always complete, but what it
-        visits after the last step of the budget does not count (S6.2-04)."""
+        """unit -> step of its first visit. Iterations are always complete, so the last may exceed
+        the budget; units that it visits after the last step of the budget do not count
+        (S6.2-04)."""
         return {unit: step for unit, step in self.first_visits.items() if step <= self.budget}
 
     def metrics(self):
         """Steps, visited units, and %Cov as a share; None where full coverage is unknown."""
         units = len(self.visited())
-        # Cut at 1, because where `full` is an estimate, more units may be visited (S5-03).
+        # At most 1: where `full` is an estimate, more units may be visited (S5-03).
         share = min(1.0, units / self.full) if self.full else None
         return {"steps": self.steps, "units": units, "coverage": share}
 
@@ -973,7 +993,7 @@ class BasicBlock(nn.Module):
 
 class ResNet18(nn.Module):
     """17 convolutions, not counting the shortcuts, and a linear layer (He et al. 2016):
-    (B, C, H, W) -> (B, out)."""
+    (batch, C, H, W) -> (batch, out)."""
 
     def __init__(self, channels, out):
         super().__init__()
@@ -993,13 +1013,13 @@ class ResNet18(nn.Module):
         self.linear = nn.Linear(512, out)
 
     def forward(self, x):
-        x = self.layers(x)  # (B, 512, h, w)
+        x = self.layers(x)  # (batch, 512, h, w)
         # Equal to AdaptiveAvgPool2d(1), whose gradient is not deterministic on CUDA.
         return self.linear(x.mean((2, 3)))
 
 
 def conv_norm(inputs, width, kernel, stride, padding):
-    """A convolution without a bias, and batch normalisation, which has one."""
+    """A convolution, and batch normalisation, which supplies the bias."""
     conv = nn.Conv2d(inputs, width, kernel, stride, padding, bias=False)
     return [conv, nn.BatchNorm2d(width)]
 
@@ -1010,7 +1030,8 @@ SMALL_LAYERS = ((16, 4, 4, 0), (32, 3, 2, 1), (32, 3, 2, 1))
 
 
 def conv_encoder(layers, shape, out, batch_norm):
-    """Convolutions and a linear layer for frames of this shape: (B, C, H, W) -> (B, out)."""
+    """Convolutions and a linear layer for frames of this shape:
+    (batch, C, H, W) -> (batch, out)."""
     modules = []
     channels = channels_of(shape)
     for width, kernel, stride, padding in layers:
@@ -1023,7 +1044,7 @@ def conv_encoder(layers, shape, out, batch_norm):
     modules.append(nn.Flatten())
     example = torch.zeros(1, channels_of(shape), *shape[:2])
     try:
-        features = nn.Sequential(*modules).eval()(example)  # in evaluation mode nothing is learned
+        features = nn.Sequential(*modules).eval()(example)  # keeps the statistics of BatchNorm
     except RuntimeError:
         raise InputError(
             f"frames of {shape[0]} x {shape[1]} pixels are too small for the network: make them "
@@ -1042,7 +1063,7 @@ def channels_of(shape):
 
 
 def initialise(network, seed, number):
-    """He's initialisation, and zero biases. `number` distinguishes the networks of one seed."""
+    """He initialisation, and zero biases. `number` distinguishes the networks of one seed."""
     generator = torch.Generator()
     generator.manual_seed(np.random.SeedSequence([seed, number]).generate_state(1).item())
     for layer in network.modules():
@@ -1053,16 +1074,16 @@ def initialise(network, seed, number):
 
 
 def to_input(frames, device):
-    """(B, H, W) or (B, H, W, C) uint8 -> (B, C, H, W) float in 0..1 (S6.1-02)."""
+    """(batch, H, W) or (batch, H, W, C) uint8 -> (batch, C, H, W) float in 0..1 (S6.1-02)."""
     return channels_first(torch.from_numpy(frames).to(device)).float() / 255
 
 
 def channels_first(x):
-    """(B, H, W) or (B, H, W, C) -> (B, C, H, W)."""
+    """(batch, H, W) or (batch, H, W, C) -> (batch, C, H, W)."""
     return x.unsqueeze(1) if x.ndim == 3 else x.permute(0, 3, 1, 2)
 
 
-# -------------------------------------------------------------------- what several parts use
+# --------------------------------------------------------------------------- shared helpers
 
 
 def in_parts(frames, size=512):
@@ -1071,7 +1092,8 @@ def in_parts(frames, size=512):
 
 
 def batches(items, size):
-    """Items, already shuffled, in batches of nearly equal sizes, at most `size`."""
+    """Items, already shuffled, in batches of at most `size`. Their sizes are nearly equal: batch
+    normalisation fails on a last batch of one."""
     count = math.ceil(len(items) / size)
     return [items[k::count] for k in range(count)]
 
@@ -1088,7 +1110,7 @@ def gradient_step(optimiser, loss, name, max_norm=math.inf):
 
 
 def share_above(threshold, parts):
-    """The share of all values in these arrays above a threshold; None if there are none."""
+    """The share of all values in these arrays above a threshold; None without arrays."""
     return float(np.mean(np.concatenate(parts) > threshold)) if parts else None
 
 
@@ -1105,23 +1127,6 @@ def load_statistics(statistics, state):
     statistics.mean = state["mean"].numpy()
     statistics.var = state["var"].numpy()
     statistics.count = state["count"]
-
-
-def progress(items, what, total=None):
-    """A progress bar over a long loop; silent where stderr is not a terminal."""
-    disable = True if sys.stderr is None else None  # None: where it is not a terminal
-    return tqdm()(items, desc=what, total=total, leave=False, disable=disable)
-
-
-def tqdm():
-    """The class tqdm. Raises InputError where an invalid TQDM_ variable makes its import fail."""
-    try:
-        import tqdm
-    except ValueError as error:
-        raise InputError(
-            f"an environment variable TQDM_... is invalid ({error}): correct it, or unset it"
-        ) from None
-    return tqdm.tqdm
 
 
 # ##################################################################################################
@@ -1224,15 +1229,15 @@ class ICM(nn.Module):
         self.optimiser = torch.optim.Adam(self.parameters(), lr=config.learning_rate)
 
     def losses(self, before, actions, after):
-        """Frames (B, H, W), actions (B,), successors (B, H, W) -> inverse and forward losses, (B,)
-        each: equations 3 and 5 of Pathak et al."""
+        """Frames (batch, H, W), actions (batch,), successors (batch, H, W) -> inverse and forward
+        losses, (batch,) each: equations 3 and 5 of Pathak et al."""
         frames = to_input(np.concatenate([before, after]), self.device)
-        phi, phi_next = self.encoder(frames).chunk(2)  # (B, d) each
+        phi, phi_next = self.encoder(frames).chunk(2)  # (batch, d) each
         a = torch.from_numpy(actions).to(self.device)
-        logits = self.inverse_model(torch.cat([phi, phi_next], dim=1))  # (B, actions)
+        logits = self.inverse_model(torch.cat([phi, phi_next], dim=1))  # (batch, actions)
         inverse = F.cross_entropy(logits, a, reduction="none")
         one_hot = F.one_hot(a, self.actions)
-        predicted = self.forward_model(torch.cat([phi.detach(), one_hot], dim=1))  # (B, d)
+        predicted = self.forward_model(torch.cat([phi.detach(), one_hot], dim=1))  # (batch, d)
         forward = (predicted - phi_next.detach()).square().sum(1) / 2
         return inverse, forward
 
@@ -1336,7 +1341,7 @@ class PPO(Baseline):
         self.age = 0  # steps of the current episode
 
     def policy(self, frames):
-        """Frames (B, H, W) -> log-probabilities (B, actions), values (B,)."""
+        """Frames (batch, H, W) -> log-probabilities (batch, actions), values (batch,)."""
         out = self.network(to_input(frames, self.device))
         return F.log_softmax(out[:, :-1], dim=1), out[:, -1]
 
@@ -1378,7 +1383,7 @@ class PPO(Baseline):
         actions = np.empty(T, np.int64)
         log_p = np.empty(T, np.float32)
         values = np.empty(T, np.float32)
-        for t in progress(range(T), "rollout"):
+        for t in range(T):
             before[t] = frame
             actions[t], log_p[t], values[t] = self.act(frame, rng)
             frame, ended = self.step(int(actions[t]))
@@ -1405,7 +1410,7 @@ class PPO(Baseline):
         """One optimiser step on B states: the clipped objective, the value loss and the entropy
         (Schulman et al. 2017, equations 7 and 9). Returns the losses by name."""
         log_p, values = self.policy(frames)
-        old_log_p = torch.from_numpy(old_log_p).to(values)  # (B,)
+        old_log_p = torch.from_numpy(old_log_p).to(values)  # (batch,)
         advantages = torch.from_numpy(advantages).to(values)
         returns = torch.from_numpy(returns).to(values)
         ratio = (log_p[range(len(actions)), actions] - old_log_p).exp()
@@ -1449,7 +1454,7 @@ class Cells(nn.Module):
         """Frames (T, H, W) uint8 -> cells (T, 88)."""
         cells = []
         for part in in_parts(frames):
-            gray = to_input(part, "cpu").mean(1, keepdim=True)  # (B, 1, H, W)
+            gray = to_input(part, "cpu").mean(1, keepdim=True)  # (batch, 1, H, W)
             small = F.interpolate(gray, (8, 11), mode="area").flatten(1)
             cells.append((small * 8).clamp(max=7).byte())
         return torch.cat(cells)
@@ -2417,7 +2422,9 @@ def show(run):
         f"{config.pretrain_steps:,} of them pretraining; run folder {run.folder}\n{HEADING}"
     )
     try:
-        with progress(None, "steps", total=config.steps) as bar:
+        # disable=None: no bar where stderr is not a terminal
+        disable = True if sys.stderr is None else None
+        with tqdm()(total=config.steps, desc="steps", leave=False, disable=disable) as bar:
             bar.update(coverage.steps)
             for _ in run:
                 say(table_line(run.rows[-1]))
@@ -2433,8 +2440,19 @@ def show(run):
         say(text)
 
 
+def tqdm():
+    """The class tqdm. Raises InputError where an invalid TQDM_ variable makes its import fail."""
+    try:
+        import tqdm
+    except ValueError as error:
+        raise InputError(
+            f"an environment variable TQDM_... is invalid ({error}): correct it, or unset it"
+        ) from None
+    return tqdm.tqdm
+
+
 def say(text, file=None):
-    """Print a line above the progress bars."""
+    """Print a line above the progress bar."""
     file = file or sys.stdout
     if file is not None:  # None: the process was started without it
         tqdm().write(text, file=file)

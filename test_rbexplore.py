@@ -333,7 +333,7 @@ def test_S4_01_a_rollback_to_another_frame_is_an_error():
 
 def with_novel_states(a, novel, additional=(2000, 2001)):
     """Let RND find these numbers novel, and additional walks visit those."""
-    a.novelty.reward = lambda frames: np.array([3.0 * (number(f) in novel) for f in frames])
+    a.rnd.reward = lambda frames: np.array([3.0 * (number(f) in novel) for f in frames])
     a.walks = lambda states, seeds, limit: [
         tau([number(state.frame), *additional]) for state in states
     ]
@@ -394,7 +394,7 @@ def test_S4_05_RND_trains_on_the_states_of_the_exploration_trajectories():
     a = restarted(beta=-1e9)
     a.iterate()
     trained = []
-    a.novelty.fit = lambda trajectories, rng: trained.extend(f.tobytes() for f in trajectories)
+    a.rnd.fit = lambda trajectories, rng: trained.extend(f.tobytes() for f in trajectories)
     i = a.iterate()
     assert len(i.additional) == 3
     assert trained == [t.frames.tobytes() for t in i.trajectories]
@@ -404,10 +404,10 @@ def test_S4_05_novelty_is_measured_by_RND_as_trained_before_the_iteration():
     a = restarted(beta=-1e9)
     a.iterate()
     x = pictures(5)
-    reward = a.novelty.reward
+    reward = a.rnd.reward
     before = reward(x)
     during = []
-    a.novelty.reward = lambda frames: during.append(reward(x)) or reward(frames)
+    a.rnd.reward = lambda frames: during.append(reward(x)) or reward(frames)
     a.iterate()
     assert [r.tobytes() for r in during] == [before.tobytes()] * 4
     assert reward(x).tobytes() != before.tobytes()
@@ -418,7 +418,7 @@ def test_S4_06_R_and_RND_train_on_the_data_of_this_iteration_only():
     a = restarted(M=1, L=1, beta=1e9, prefix=False)
     seen_by = {"R": [], "RND": []}
     a.similarity.update = lambda s_1, s_2, y: seen_by["R"].extend(numbers([*s_1, *s_2])) or 0.0
-    a.novelty.update = lambda frames: seen_by["RND"].extend(numbers(frames)) or 0.0
+    a.rnd.update = lambda frames: seen_by["RND"].extend(numbers(frames)) or 0.0
     for k in (1000, 2000, 3000):
         walking(a, [0, *range(k, k + 14)])
         a.iterate()
@@ -932,7 +932,7 @@ def B_of(rewards, L=100, trajectories=None, seeds=(0,), **changes):
     """The states from which additional walks start, where RND gives these rewards, else 0: one
     list for each seed."""
     a = restarted(L=L, **changes)
-    a.novelty.reward = lambda frames: np.array([rewards.get(number(f), 0.0) for f in frames])
+    a.rnd.reward = lambda frames: np.array([rewards.get(number(f), 0.0) for f in frames])
     started = []
     a.walks = lambda states, seeds, limit: started.append(states) or iter([])
     trajectories = trajectories or [tau(range(20))]
@@ -972,11 +972,11 @@ def test_S4_2_18_additional_trajectories_serve_R_solely(walked):
     """The resulting trajectories are used solely to generate additional training data for R"""
     a = restarted(M=1, beta=0.5)
     a.similarity = Stub(tens)
-    a.novelty.reward = lambda frames: np.arange(len(frames)) * 1.0
+    a.rnd.reward = lambda frames: np.arange(len(frames)) * 1.0
     walks = [tau([0, 1000, 1010]), tau([1000, *walked]), tau([1010, *walked])]
     a.walks = lambda states, seeds, limit: [walks.pop(0) for _ in states]
     trained = []
-    a.novelty.fit = lambda trajectories, rng: trained.extend(map(numbers, trajectories))
+    a.rnd.fit = lambda trajectories, rng: trained.extend(map(numbers, trajectories))
     assert len(a.iterate().additional) == 2
     assert visits(a.graph) == {0: 2, 1: 1, 2: 1}
     assert list(a.coverage.first_visits.values()) == [0, 1, 2]
@@ -987,9 +987,9 @@ def test_S4_2_18_their_steps_count_and_their_units_do_not():
     a = restarted()
     a.coverage.first_visits.clear()
     a.walks = lambda states, seeds, limit: [tau([0, 7, 8])]
-    a.collect([State(frame(0), b"0")], 20, False, np.random.default_rng(0))
+    a.collect([State(frame(0), b"0")], 20, np.random.default_rng(0), covers=False)
     assert (a.coverage.steps, a.coverage.first_visits) == (2, {})
-    a.collect([State(frame(0), b"0")], 20, True, np.random.default_rng(0))
+    a.collect([State(frame(0), b"0")], 20, np.random.default_rng(0), covers=True)
     assert (a.coverage.steps, a.coverage.first_visits) == (4, {(7,): 3, (8,): 4})
 
 
@@ -1343,7 +1343,7 @@ def test_R18_a_step_of_RND_is_down_its_mean_error_unclipped_by_one_Adam():
 
 def test_where_L_is_0_nothing_of_RND_runs():
     a = restarted(L=0)
-    a.novelty = None
+    a.rnd = None
     i = a.iterate()
     assert (i.novelty, i.additional) == ([], [])
     assert (i.metrics["novel_share"], i.metrics["rnd_loss"]) == (None, None)
@@ -1597,9 +1597,9 @@ def test_S6_1_14_RND_is_initialised_during_pretraining():
     while a.coverage.steps < a.config.pretrain_steps:
         a.iterate()
     a.restart()
-    assert a.novelty.pixels.count > 300
-    assert a.novelty.pixels.mean.std() > 0
-    assert len(a.novelty.recent_errors) == a.iteration > 1
+    assert a.rnd.pixels.count > 300
+    assert a.rnd.pixels.mean.std() > 0
+    assert len(a.rnd.recent_errors) == a.iteration > 1
 
 
 def pretrained():
@@ -1615,9 +1615,9 @@ def test_S6_1_15_R31_G_is_reset_to_the_initial_state_and_R_is_kept():
     """After pretraining the graph G is reset to the initial state, and RbExplore is restarted"""
     a = pretrained()
     assert len(a.graph.arcs) + a.graph.clusters[0].visits > 1
-    before = plain([a.similarity.state_dict(), a.novelty.state_dict(), a.iteration])
+    before = plain([a.similarity.state_dict(), a.rnd.state_dict(), a.iteration])
     a.restart()
-    assert plain([a.similarity.state_dict(), a.novelty.state_dict(), a.iteration]) == before  # R31
+    assert plain([a.similarity.state_dict(), a.rnd.state_dict(), a.iteration]) == before  # R31
     assert (visits(a.graph), a.graph.arcs, a.graph.E_parent) == ({0: 1}, {}, {})
     assert a.theta_sim_now() == 0.95
 
@@ -1678,7 +1678,7 @@ def test_S6_3_02_without_prefixes_the_other_pairs_are_identical():
 def test_the_metrics_are_what_the_iteration_did():
     a = explorer(theta_merge=0.4, beta=1.0)
     a.similarity = Stub(lambda s, s_i: 1 / (1 + abs(s - s_i)))
-    a.novelty.reward = lambda frames: np.arange(len(frames)) / 10
+    a.rnd.reward = lambda frames: np.arange(len(frames)) / 10
     clusters = 1
     for _ in range(6):
         was_pretraining = a.pretraining
