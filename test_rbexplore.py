@@ -76,7 +76,9 @@ from rbexplore import (
 
 torch.set_num_threads(1)  # networks this small are faster so
 HERE = pathlib.Path(__file__).parent
-TINY = replace(MAZE, steps=800, pretrain_steps=400, M=4, L=3, trajectory_steps=40, merge_every=2)
+TINY = replace(
+    MAZE, steps=800, pretrain_steps=400, M=4, L=3, trajectory_steps=40, merge_every=2, epochs=1
+)
 
 # --------------------------------------------------------------------------------------- helpers
 
