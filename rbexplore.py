@@ -50,13 +50,14 @@ import math
 import multiprocessing
 import os
 import pathlib
+import shlex
 import signal
 import sys
 import threading
 import time
 import warnings
 import zipfile
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -1137,10 +1138,9 @@ def load_statistics(statistics, state):
 
 
 class Baseline:
-    """What the compared methods share: the interface of RbExplore that Run uses. A subclass
-    implements advance(rng), which acts and learns for one iteration and returns metrics."""
-
-    pretraining = False
+    """Base class of the agents that RbExplore is compared with: the part of its interface that Run
+    uses. A subclass implements advance(rng), which acts and learns for one iteration and returns
+    metrics."""
 
     def __init__(self, env_fn: Callable[[], PersistentEnv], config: Config):
         self.config = config
@@ -1154,18 +1154,24 @@ class Baseline:
     def iterate(self) -> Iteration:
         """Run one iteration."""
         self.iteration += 1
-        metrics = self.advance(np.random.default_rng([self.config.seed, self.iteration]))
-        progress_made = {"iteration": self.iteration, "phase": "explore", **self.coverage.metrics()}
-        return Iteration(progress_made | metrics)
+        agent_metrics = self.advance(np.random.default_rng([self.config.seed, self.iteration]))
+        metrics = {
+            "iteration": self.iteration,
+            "phase": "explore",
+            **self.coverage.metrics(),
+            **agent_metrics,
+        }
+        return Iteration(metrics)
 
     def reset(self):
         """Return to s_init. Returns its frame."""
         return np.array(self.env.reset(seed=self.config.seed)[0])
 
     def step(self, action):
-        """One step. Returns the frame, and whether the episode has ended."""
-        action += int(self.env.action_space.start)
-        frame, _, terminated, truncated, _ = self.env.step(action)
+        """One step of an action, counted from 0. Returns the frame, and whether the episode has
+        ended."""
+        first = int(self.env.action_space.start)
+        frame, _, terminated, truncated, _ = self.env.step(first + action)
         self.coverage.count(unit_key(self.env.unit()))
         return np.array(frame), bool(terminated or truncated)
 
@@ -1178,7 +1184,8 @@ class Baseline:
 
 
 class Random(Baseline):
-    """Uniform actions, M episodes per iteration, each from s_init."""
+    """Uniform actions, in M episodes of at most trajectory_steps per iteration, each from
+    s_init."""
 
     method = "random"
 
@@ -1193,8 +1200,8 @@ class Random(Baseline):
 
 
 class RNDBonus(RND):
-    """The bonus of Burda et al. 2019: the error of RND on the successor, without the scale of
-    R4."""
+    """The bonus of Burda et al. 2019: the error of RND on the successor, without the normalisation
+    of RND.reward. It has the interface of ICM, and ignores the state and the action."""
 
     def bonus(self, before, actions, after):
         """Frames (T, H, W), actions (T,), successors (T, H, W) -> bonus (T,). Updates the
@@ -1209,7 +1216,8 @@ class RNDBonus(RND):
 
 class ICM(nn.Module):
     """The intrinsic curiosity module (Pathak et al. 2017): the bonus is the error of a forward
-    model, in the features of an encoder that only the inverse model trains. Its layers are RND's.
+    model, in the features of an encoder that only the inverse model trains. The encoder has the
+    layers of RND's target network.
 
     actions: the number of actions."""
 
@@ -1290,14 +1298,14 @@ class Rollout:
     after: np.ndarray  # successors (T, H, W)
     log_p: np.ndarray  # log-probabilities of the actions (T,)
     values: np.ndarray  # of the states before (T,)
-    last_value: float  # of the state after the last step
+    last_value: float  # of the state from which the next rollout starts
 
 
 class PPO(Baseline):
-    """Proximal policy optimisation (Schulman et al. 2017) of a bonus only, RND's or ICM's, with the
-    settings of Burda et al. 2019, table 5 (R27), except that one actor makes a rollout that is by
-    default as long as those of their 128 together, and that the policy sees what RbExplore sees:
-    one frame (5).
+    """Proximal policy optimisation (Schulman et al. 2017) of a bonus only, RND's or ICM's. The
+    settings are those of Burda et al. 2019, table 5 (R27), with three differences: one actor makes
+    a rollout that is by default as long as those of their 128 together; the policy sees one frame,
+    as RbExplore does (5); the predictor learns from every state.
 
     method: rnd or icm."""
 
@@ -1332,7 +1340,7 @@ class PPO(Baseline):
             else:
                 self.curiosity = ICM(config, shape, self.actions, device)
         initialise(self.network, config.seed, 3)
-        head.weight.data *= 0.01  # so that the first policy is nearly uniform
+        head.weight.data *= 0.01  # so that the first policy is nearly uniform, and values near 0
         self.network.to(device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.discounted_sum = 0.0  # of the bonus so far
@@ -1407,7 +1415,7 @@ class PPO(Baseline):
         return bonus / np.sqrt(self.discounted_sums.var + 1e-8)
 
     def update(self, frames, actions, old_log_p, advantages, returns):
-        """One optimiser step on B states: the clipped objective, the value loss and the entropy
+        """One optimiser step on a minibatch: the clipped objective, the value loss and the entropy
         (Schulman et al. 2017, equations 7 and 9). Returns the losses by name."""
         log_p, values = self.policy(frames)
         old_log_p = torch.from_numpy(old_log_p).to(values)  # (batch,)
@@ -1448,7 +1456,8 @@ class PPO(Baseline):
 
 class Cells(nn.Module):
     """Go-Explore's cells without domain knowledge (Ecoffet et al. 2019) in place of R: two frames
-    are similar if they are equal in 11 x 8 pixels of 8 grey levels. Nothing is learned."""
+    are similar if they are equal when reduced to 11 x 8 pixels of 8 grey levels. Nothing is
+    learned."""
 
     def embed(self, frames):
         """Frames (T, H, W) uint8 -> cells (T, 88)."""
@@ -1480,8 +1489,10 @@ def make_method(
     device: str = "cpu",
     executor: Executor | None = None,
 ):
-    """RbExplore, or another method with its interface. The others do not train R, so they skip
-    pretraining and additional trajectories."""
+    """RbExplore, or another method with its interface. Pretraining and additional trajectories
+    serve to train R, so the others have none. Raises InputError for an unknown method."""
+    if method not in METHODS:
+        raise InputError(f"unknown method {method!r}: there are {', '.join(METHODS)}")
     if method == "rbexplore":
         return RbExplore(env_fn, config, device, executor)
     config = replace(config, pretrain_steps=0, L=0)
@@ -1500,20 +1511,20 @@ def make_method(
 
 class Run:
     """A run in a folder. Iterating over it runs the algorithm until its steps are spent, and yields
-    each Iteration after it was saved:
+    each Iteration once it has been saved:
 
         with Run("runs/mine", explorer).begin() as run:  # or resume()
             for iteration in run:
                 print(iteration.metrics)
 
-    A run is resumed from checkpoint.pt alone; config.json and metrics.csv are for people. While it
-    works, and inside `with`, it holds the folder's lock. Whatever interrupts an iteration, the
-    algorithm is back at the last complete one before the exception leaves the run.
+    A run is resumed from checkpoint.pt alone; config.json and metrics.csv are for people. The run
+    holds the folder's lock while it iterates, and inside `with`. If an iteration is interrupted,
+    the algorithm returns to the last complete one before the exception is raised.
 
-    settings: plain data to record beside the method and its configuration.
+    settings: plain data to record in addition to the method and its configuration.
     stop_at_full: stop at full coverage.
 
-    Raises InputError where another process works in the folder."""
+    Its methods raise InputError if another process holds the lock."""
 
     def __init__(
         self,
@@ -1535,10 +1546,11 @@ class Run:
         self.stop_at_full = stop_at_full
         self.rows: list[dict] = []  # the metrics of each iteration
         self.ended_at_once = 0  # trajectories in a row that ended at their first step
+        self.started = False  # whether begin() or resume() was called
         self.lock = filelock.FileLock(self.folder / ".lock", timeout=0)
 
     def __enter__(self) -> "Run":
-        """Hold the lock; a run may hold it more than once."""
+        """Acquire the lock; nested uses are counted."""
         try:
             self.lock.acquire()
         except filelock.Timeout:
@@ -1558,17 +1570,21 @@ class Run:
         with self:
             check_unused(self.folder)  # again, now that no other process can begin in it
             self.save()
+        self.started = True
         return self
 
     def resume(self) -> "Run":
         """Continue after the last complete iteration. Returns the run."""
-        read_checkpoint(self.folder)  # so that nothing is created where there is no run
+        read_checkpoint(self.folder)  # before the lock, which would create a file
         with self:
             self.load()
-            self.save()
+            self.save()  # records settings that changed, such as more steps
+        self.started = True
         return self
 
     def __iter__(self) -> Iterator[Iteration]:
+        if not self.started:
+            raise InputError(f"call begin() or resume() of the run in {self.folder} first")
         with self:
             while not self.is_done():
                 began = time.monotonic()
@@ -1584,7 +1600,7 @@ class Run:
                 yield iteration
 
     def is_done(self) -> bool:
-        """Whether the steps are spent, or full coverage is reached where that is to be the end."""
+        """Whether the steps are spent or, with stop_at_full, the level is covered."""
         coverage = self.algorithm.coverage
         if self.stop_at_full and coverage.full and len(coverage.visited()) >= coverage.full:
             return True
@@ -1612,7 +1628,7 @@ class Run:
             "s_init": torch.from_numpy(self.algorithm.initial_state.frame),
             "algorithm": self.algorithm.state_dict(),
         }
-        content = io.BytesIO()  # not the file, because torch reports a full disk in its own way
+        content = io.BytesIO()  # not the file: on a full disk, torch raises no OSError
         torch.save(state, content)
         write_atomically(self.folder / "checkpoint.pt", content.getvalue())
         for_people = {
@@ -1622,7 +1638,7 @@ class Run:
         for name, text in for_people.items():
             try:
                 write_atomically(self.folder / name, text.encode())
-            except OSError as error:  # the run does not need it; the next iteration tries again
+            except OSError as error:  # the run does not need the file; try again next time
                 problem = error.strerror or error
                 warnings.warn(f"{self.folder / name} cannot be written: {problem}", stacklevel=3)
 
@@ -1651,16 +1667,16 @@ class Run:
 
 
 def check_unused(folder):
-    """Raise InputError for a folder that holds a run, or anything else; nothing is changed."""
+    """Raise InputError unless the folder is missing or empty. Nothing is changed."""
     if (folder / "checkpoint.pt").exists():
         raise InputError(f"{folder} holds a run already: resume it, or choose another folder")
-    left_by_a_kill = {".lock", "checkpoint.pt.new"}
-    if folder.exists() and {path.name for path in folder.iterdir()} - left_by_a_kill:
+    leftovers = {".lock", "checkpoint.pt.new"}  # of a run that was killed before its first save
+    if folder.exists() and {path.name for path in folder.iterdir()} - leftovers:
         raise InputError(f"{folder} is not empty and holds no run: choose another folder")
 
 
 def write_atomically(path, content):
-    """Replace a file so that a reader, a kill or a full disk leaves the old file or the new one."""
+    """Replace a file atomically: whatever happens, it has its old content or the new one."""
     temporary = path.with_name(path.name + ".new")
     try:
         with open(temporary, "wb") as file:
@@ -1684,12 +1700,13 @@ def read_checkpoint(folder: str | os.PathLike) -> dict:
         if broken:
             raise zipfile.BadZipFile(broken)
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        Config(**state["settings"]["config"])  # fails for a checkpoint of another version
         return {name: state[name] for name in ("settings", "rows", "s_init", "algorithm")}
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"there is no run in {folder}: it has no checkpoint.pt") from None
     except (OSError, MemoryError):
         raise
-    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
+    except Exception as error:  # a damaged file makes zipfile and torch raise many kinds
         raise damaged(folder, error) from None
 
 
@@ -1701,9 +1718,9 @@ def damaged(folder, error):
 
 
 def csv_text(rows):
-    """A CSV file of dicts, with a column for every key. None is an empty cell."""
+    """Dicts with the same keys as the text of a CSV file. None is an empty cell."""
     text = io.StringIO()
-    names = dict.fromkeys(name for row in rows for name in row)
+    names = list(rows[0]) if rows else []
     writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -1727,31 +1744,34 @@ def verify(explorer: RbExplore, steps: int = 10) -> dict[int, str]:
     centre. Then take the same random steps from the replayed state and from the restored snapshot,
     and compare every frame, unit and end: this also reveals hidden state that no frame shows.
 
+    A prefix that clusters share is replayed once: each arc of E_parent is replayed from a snapshot
+    of the state in which the replay of its parent ended.
+
     Returns a verdict for each cluster: "exact", or what differs."""
     env = explorer.env
     graph = explorer.graph
     rng = np.random.default_rng(explorer.config.seed)
+    arcs = {0: ParentArc(0, explorer.initial_state.frame[None], b"")}  # no actions lead to s_init
+    arcs.update(sorted(graph.E_parent.items()))  # parents first
+    replays = {0: explorer.initial_state.snapshot}  # None: the episode ended on the way
     verdicts = {}
-    # A prefix that clusters share is replayed once: each arc of E_parent continues from the
-    # replayed state of the parent, which has a smaller number.
-    root = ParentArc(0, explorer.initial_state.frame[None], b"")
-    replayed = {0: explorer.initial_state.snapshot}  # None: the replay ended on the way
-    for v, arc in sorted({0: root, **graph.E_parent}.items()):
-        tests = rng.integers(env.action_space.n, size=steps).tolist()
-        parent = replayed[arc.parent]
-        arrived = None if parent is None else play(env, parent, arc.actions)[-1]
-        replayed[v] = None
+    for v, arc in arcs.items():
+        random_actions = rng.integers(env.action_space.n, size=steps).tolist()
+        arrived = None
         after_replay = []
+        if replays[arc.parent] is not None:
+            arrived = play(env, replays[arc.parent], arc.actions)[-1]
+        replays[v] = None
         if arrived is not None and not arrived.terminated:
-            replayed[v] = env.snapshot()
-            after_replay = play(env, None, tests)
+            replays[v] = env.snapshot()
+            after_replay = play(env, None, random_actions)
         if v not in graph.clusters:  # it was merged
             continue
         cluster = graph.clusters[v]
-        restored, *after_restore = play(env, cluster.snapshot, tests)
+        restored, *after_restore = play(env, cluster.snapshot, random_actions)
         if restored.frame != cluster.frame.tobytes():
             verdicts[v] = "the snapshot does not restore the centre"
-        elif replayed[v] is None or arrived[:2] != restored[:2]:
+        elif replays[v] is None or (arrived.frame, arrived.unit) != (restored.frame, restored.unit):
             verdicts[v] = "the actions do not lead to the centre"
         elif after_replay != after_restore:
             verdicts[v] = "the next steps after replay and after restore differ"
@@ -1896,8 +1916,8 @@ def curve_of(coverage, grid):
 
 
 def curves_figure(groups, unit_name, pretrain_steps):
-    """Coverage against steps: for each group of runs their mean, and a band from the least to the
-    most of them (S6.2-05), up to the step that all of them have reached.
+    """Coverage against steps: for each group of runs their mean, and a band from their minimum to
+    their maximum (S6.2-05), up to the step that all of them have reached.
 
     groups: label -> the coverage of each run."""
     figure = new_figure(7, 4.5)
@@ -1905,17 +1925,19 @@ def curves_figure(groups, unit_name, pretrain_steps):
     if pretrain_steps:
         panel.axvspan(0, pretrain_steps, color="0.9", label="pretraining")
     for k, (label, runs) in enumerate(groups.items()):
-        grid = np.linspace(0, min(runs[0].budget, *(c.steps for c in runs)), 501).astype(int)
+        budget = runs[0].budget
+        full = runs[0].full
+        last_step = min(budget, *(coverage.steps for coverage in runs))
+        grid = np.linspace(0, last_step, 501).astype(int)
         curves = np.stack([curve_of(coverage, grid) for coverage in runs])  # (runs, grid)
         style = ("-", "--", "-.", ":")[k % 4]  # so that curves which coincide both show
         (line,) = panel.plot(grid, curves.mean(0), style, label=label)
-        least = curves.min(0)
-        most = curves.max(0)
-        panel.fill_between(grid, least, most, color=line.get_color(), alpha=0.2, linewidth=0)
-    full = runs[0].full
-    panel.set_xlabel("agent steps (exploration, additional, pretraining)")
+        low = curves.min(0)
+        high = curves.max(0)
+        panel.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    panel.set_xlabel("agent steps (all that the method takes)")
     panel.set_ylabel(f"coverage, % of {full} {unit_name}" if full else f"coverage, {unit_name}")
-    panel.set(xlim=(0, runs[0].budget), ylim=(0, 102 if full else None))
+    panel.set(xlim=(0, budget), ylim=(0, 102 if full else None))
     figure.legend(loc="outside upper center", ncols=4, fontsize=8)
     return figure
 
@@ -1931,7 +1953,6 @@ def maps_figure(level, found):
     panels = figure.subplots(math.ceil(len(found) / across), across, squeeze=False).ravel()
     for panel in panels[len(found) :]:
         panel.axis("off")
-    label = "step of the first visit"
     for panel, (title, coverage) in zip(panels, found.items(), strict=False):
         level.show(panel, title)
         visited = {u: step for u, step in coverage.visited().items() if u in level.boxes}
@@ -1947,15 +1968,17 @@ def maps_figure(level, found):
             for unit in level.boxes.keys() - visited.keys():
                 left, top, w, h = level.boxes[unit]
                 panel.plot([left, left + w], [top, top + h], color="tab:red", linewidth=1)
-                label = "step of the first visit (red: not visited)"
+    label = "step of the first visit"
+    if level.picture is not None:
+        label += " (red: not visited)"
     bar = figure.colorbar(colours, ax=panels.tolist(), label=label, shrink=0.8)
     bar.solids.set_alpha(1)
     return figure
 
 
 def places_of(explorer, level):
-    """cluster -> the point of its centre in the level, for clusters whose unit has a place. Those
-    of one unit are spread over a grid in its box."""
+    """cluster -> its point in the level, for clusters whose unit has a box. Those of one unit are
+    spread over its box. The environment is left in one of the clusters."""
     crowds = {}
     for v, cluster in explorer.graph.clusters.items():
         explorer.env.restore(cluster.snapshot)
@@ -1987,19 +2010,19 @@ def graph_figure(graph, level, places):
     busiest = sorted(graph.arcs.items(), key=lambda arc: -arc[1])
     crossings = np.cumsum([visits for _, visits in busiest])
     shown = busiest[: 1 + int(np.searchsorted(crossings, 0.9 * sum(graph.arcs.values())))]
-    title = f"{len(graph.clusters)} clusters; {len(shown)} of {len(graph.arcs)} arcs"
-    level.show(panel, f"{title} (90 % of the crossings), thick at their start")
     tapers = []
     colours = []
-    for (start, end), visits in reversed(shown):
-        if start in places and end in places:
+    for (source, target), visits in reversed(shown):
+        if source in places and target in places:
             strength = math.sqrt(visits / busiest[0][1])
-            along = places[end] - places[start]
+            along = places[target] - places[source]
             sideways = np.array([-along[1], along[0]]) / max(np.hypot(*along), 1e-9)
             sideways *= level.width * (0.0005 + 0.0025 * strength)
             # On one side of the line, so that the arcs of both directions show.
-            tapers.append([places[start], places[start] + 2 * sideways, places[end]])
+            tapers.append([places[source], places[source] + 2 * sideways, places[target]])
             colours.append((1, 1, 1, 0.15 + 0.75 * strength))
+    title = f"{len(places)} clusters; {len(tapers)} of {len(graph.arcs)} arcs"
+    level.show(panel, f"{title} (90 % of the crossings), thick at their start")
     panel.add_collection(PolyCollection(tapers, facecolors=colours))
     most = max(cluster.visits for cluster in graph.clusters.values())
     sizes = [15 + 100 * graph.clusters[v].visits / most for v in places]
@@ -2015,7 +2038,7 @@ def graph_figure(graph, level, places):
 
 
 def evenly(items, most):
-    """At most so many of the items, evenly chosen, the first and the last included."""
+    """At most `most` of the items, evenly spaced, the first and the last included."""
     return [items[k] for k in np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)]
 
 
@@ -2045,11 +2068,11 @@ def viewable(frame):
 
 
 def route_animation(graph):
-    """The longest full prefix in G, in at most 300 images."""
+    """The full prefix of the cluster farthest from s_init, in at most 300 images."""
     from PIL import Image
 
-    furthest = max(graph.clusters, key=lambda v: len(graph.actions_to(v)))
-    states = graph.full_prefix(furthest) or [graph.clusters[0].frame]
+    farthest = max(graph.clusters, key=lambda v: len(graph.actions_to(v)))
+    states = graph.full_prefix(farthest) or [graph.clusters[0].frame]
     scale = max(1, 256 // max(states[0].shape[:2]))
     frames = [viewable(s).repeat(scale, axis=0).repeat(scale, axis=1) for s in evenly(states, 300)]
     return [Image.fromarray(frame) for frame in frames]
@@ -2058,8 +2081,8 @@ def route_animation(graph):
 # ------- the comparison of runs (6.2, 6.3; S6.2-05, S6.2-06, S6.3-01, S6.3-02, S6.3-03)
 
 
-class Found(NamedTuple):
-    """What a run folder says of its run."""
+class SavedRun(NamedTuple):
+    """What compare() needs of a run."""
 
     folder: str
     settings: dict
@@ -2069,16 +2092,14 @@ class Found(NamedTuple):
     s_init: np.ndarray
 
 
-CURVE = ("iteration", "steps", "units", "coverage")  # the columns of curves.csv
-
-
 def read_run(folder):
+    """The run saved in a folder."""
     state = read_checkpoint(folder)
     settings = state["settings"]
     config = Config(**settings["config"])
     coverage = Coverage(settings["full_coverage"], config.steps)
     coverage.load_state_dict(state["algorithm"]["coverage"])
-    return Found(folder, settings, config, coverage, state["rows"], state["s_init"].numpy())
+    return SavedRun(folder, settings, config, coverage, state["rows"], state["s_init"].numpy())
 
 
 def compare(folders: list[str], out: str | os.PathLike, figures: bool = True) -> str:
@@ -2087,52 +2108,59 @@ def compare(folders: list[str], out: str | os.PathLike, figures: bool = True) ->
     Returns the table, in Markdown.
 
     Raises InputError for runs that cannot be compared."""
-    groups = group([read_run(folder) for folder in folders])
+    different = {os.path.realpath(os.path.expanduser(folder)): folder for folder in folders}
+    groups = group([read_run(folder) for folder in different.values()])
     out = pathlib.Path(os.path.expanduser(out))
     out.mkdir(parents=True, exist_ok=True)
-    table = [table_row(label, runs) for label, runs in groups.items()]
+    table = []
+    curves = []
+    for label, runs in groups.items():
+        table.append(table_row(label, runs))
+        for run in runs:
+            for row in run.rows:
+                point = {name: row[name] for name in ("iteration", "steps", "units", "coverage")}
+                curves.append({"group": label, "seed": run.config.seed, **point})
     write_atomically(out / "table.csv", csv_text(table).encode())
-    curves = [
-        {"group": label, "seed": run.config.seed} | {name: row[name] for name in CURVE}
-        for label, runs in groups.items()
-        for run in runs
-        for row in run.rows
-    ]
     write_atomically(out / "curves.csv", csv_text(curves).encode())
     if figures:
         with default_matplotlib():
             save_figures(out, comparison_figures(groups))
-    lines = [list(table[0]), ["---"] * len(table[0]), *(row.values() for row in table)]
+    lines = [list(table[0]), ["---"] * len(table[0])]
+    lines += [list(row.values()) for row in table]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def group(runs):
-    """label -> runs whose settings are equal except for the seed. A label names the method, unless
-    it is rbexplore, and the fields that differ between groups and from the default."""
-    config_of = {}
-    members = {}
+    """label -> the runs whose settings are equal except for the seed. A label names the method,
+    unless it is rbexplore, and the fields that differ between runs and from the default."""
+    values = {}  # of each field: those that occur
     for run in runs:
         check_comparable(runs[0], run)
-        method = run.settings["method"]
-        config = asdict(replace(run.config, seed=0))
-        if method != "rbexplore":  # these skip pretraining and have L = 0
-            del config["pretrain_steps"], config["L"]
-        key = (method, *config.values())
-        config_of[key] = config
-        members.setdefault(key, []).append(run)
+        for name, value in settings_compared(run).items():
+            values.setdefault(name, set()).add(value)
     default = asdict(default_config(runs[0].settings.get("env")))
     groups = {}
-    for key, config in config_of.items():
-        words = [] if key[0] == "rbexplore" else [key[0]]
-        for name, value in config.items():
-            differs = any(other.get(name, value) != value for other in config_of.values())
-            if differs and value != default[name]:
-                if isinstance(value, bool):
-                    words.append(name if value else f"no {name}")
-                else:
-                    words.append(f"{name} {value}")
-        groups[", ".join(words) or "rbexplore"] = members[key]
+    for run in runs:
+        method = run.settings["method"]
+        words = [] if method == "rbexplore" else [method]
+        for name, value in settings_compared(run).items():
+            if len(values[name]) == 1 or value == default[name]:
+                continue
+            if isinstance(value, bool):
+                words.append(name if value else f"no {name}")
+            else:
+                words.append(f"{name} {value}")
+        groups.setdefault(", ".join(words) or "rbexplore", []).append(run)
     return groups
+
+
+def settings_compared(run):
+    """The configuration by which a run is grouped."""
+    config = asdict(run.config)
+    del config["seed"]
+    if run.settings["method"] != "rbexplore":  # see make_method
+        del config["pretrain_steps"], config["L"]
+    return config
 
 
 def check_comparable(one, other):
@@ -2152,8 +2180,8 @@ def check_comparable(one, other):
 
 
 def table_row(label, runs):
-    """The row of a group: coverage at the end in %, or in units where full coverage is unknown; the
-    median of all runs' steps to 50, 90 and 100 %."""
+    """The row of a group: coverage at the end, in % or, where full coverage is unknown, in units;
+    median steps to 50, 90 and 100 %, where a run that has not reached it counts as infinite."""
     ends = [curve_of(run.coverage, run.config.steps) for run in runs]
     unfinished = sum(run.coverage.steps < run.config.steps for run in runs)
     row = {
@@ -2184,22 +2212,25 @@ def steps_to(coverage):
 def comparison_figures(groups):
     curves = {}
     maps = {}
+    units = set()  # visited in these maps
     for label, runs in groups.items():
-        name = runs[0].settings["unit_name"]
+        unit_name = runs[0].settings["unit_name"]
         curves[label] = [run.coverage for run in runs]
         most = best(curves[label])
-        maps[f"{label}: {len(most.visited())} {name}"] = most
-    figures = {"curves.png": curves_figure(curves, name, pretrain_steps=0)}
-    env_type = ENVIRONMENTS.get(runs[0].settings.get("env"))
-    env = env_type(runs[0].settings["level"]) if hasattr(env_type, "level_map") else None
-    level = level_of(env, {unit for coverage in maps.values() for unit in coverage.visited()})
+        maps[f"{label}: {len(most.visited())} {unit_name}"] = most
+        units.update(most.visited())
+        settings = runs[0].settings
+    figures = {"curves.png": curves_figure(curves, unit_name, pretrain_steps=0)}
+    env_type = ENVIRONMENTS.get(settings.get("env"))
+    env = env_type(settings["level"]) if hasattr(env_type, "level_map") else None
+    level = level_of(env, units)
     if level.boxes:
         figures["maps.png"] = maps_figure(level, maps)
     return figures
 
 
 def best(coverages):
-    """Of a group's runs, the one that covers most at the end (S6.2-06)."""
+    """The coverage of the run in a group that covers most at the end (S6.2-06)."""
     return max(coverages, key=lambda coverage: len(coverage.visited()))
 
 
@@ -2226,7 +2257,7 @@ def parser():
     flag = {"action": "store_true", "default": None}
     add("--env", "maze, pop (Prince of Persia) or montezuma (default: maze)")
     add("--level", "1 to 3 of the maze, 1 to 14 of pop (default: 1)", type=int)
-    add("--rom", "pop: your image of the NES cartridge")
+    add("--rom", "pop: your image of the NES cartridge", metavar="FILE")
     add("--state", "pop: a start state, gzip of an emulator state")
     add(
         "--method",
@@ -2236,7 +2267,7 @@ def parser():
     )
     add(
         "--config",
-        "the values of the fields below (default: maze for the maze, else paper)",
+        "preset of the configuration below (default: maze for the maze, else paper)",
         choices=list(CONFIGS),
     )
     add("--out", "run folder (default: runs/<env>-<seed>)", metavar="FOLDER")
@@ -2255,8 +2286,12 @@ def parser():
     )
     add("--stop-at-full", "stop at full coverage", **flag)
     add("--no-figures", "draw no figures", **flag)
-    add("--workers", "processes that walk; the result is the same (default: 1)", type=count)
-    add("--threads", "threads of the arithmetic; changes the rounding (default: 1)", type=count)
+    add(
+        "--workers",
+        "processes that collect trajectories; the result is the same (default: 1)",
+        type=count,
+    )
+    add("--threads", "CPU threads of PyTorch; changes the rounding (default: 1)", type=count)
     add("--device", "device of the networks: cpu, cuda, cuda:1, ... (default: cpu)")
     heading = f"In brackets the values of --config {' | '.join(CONFIGS)}, where they differ."
     configuration = p.add_argument_group("configuration", heading)
@@ -2310,8 +2345,7 @@ def settings_of(args):
 
 
 def recorded_settings(args, folder):
-    """The settings of the run in a folder, with the changes of the command line, none of which
-    changes the result except for more steps."""
+    """The settings of the run in a folder, with the changes that the command line makes."""
     settings = read_checkpoint(folder)["settings"]
     if "env" not in settings:
         raise InputError(
@@ -2347,7 +2381,8 @@ def check_options(args, action, allowed):
 
 
 def make_algorithm(settings, stack):
-    """The method of the settings. The exit stack closes its environment and workers."""
+    """Make the algorithm that the settings describe. The exit stack closes its environment and
+    workers."""
     torch.set_num_threads(settings["threads"])
     device = settings["device"]
     if device != "cpu":  # on the CPU, every operation used here is deterministic
@@ -2389,38 +2424,52 @@ def end_with_parent():
         timer.start()
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    # Slurm sends SIGTERM to the workers too. Of a worker that ended while it was sending a
-    # trajectory, the parent would wait for the rest for ever.
+    # Slurm sends SIGTERM to the workers too. If one ended while it sends a trajectory, the parent
+    # would wait for the rest forever. Nor is the signal ignored: it is how a pool ends its workers.
     signal.signal(signal.SIGTERM, end_soon)
     threading.Thread(target=watch, daemon=True).start()
 
 
-HEADING = (
-    " iter    phase     steps  units   %Cov clusters  new merged R's loss  TPR  TNR  novel     s"
-)
-ROW = (
-    "{iteration:5} {phase:>8} {steps:9,} {units:6} {coverage:6.1%} {clusters:8} {added:4} "
-    "{merged:6} {r_loss:8.3f} {r_tpr:4.2f} {r_tnr:4.2f} {novel_share:6.1%} {seconds:5.1f}"
+# What is printed of an iteration: heading, width, metric, format.
+COLUMNS = (
+    ("iter", 5, "iteration", "d"),
+    ("phase", 8, "phase", "s"),
+    ("steps", 10, "steps", ",d"),
+    ("units", 6, "units", "d"),
+    ("%Cov", 6, "coverage", ".1%"),
+    ("clusters", 8, "clusters", "d"),
+    ("new", 4, "added", "d"),
+    ("merged", 6, "merged", "d"),
+    ("R's loss", 8, "r_loss", ".3f"),
+    ("TPR", 4, "r_tpr", ".2f"),
+    ("TNR", 4, "r_tnr", ".2f"),
+    ("novel", 6, "novel_share", ".1%"),
+    ("s", 5, "seconds", ".1f"),
 )
 
 
-def table_line(row):
-    """What is said of an iteration; - for what it has not."""
-    known = {name: value for name, value in row.items() if value is not None}
-    line = ROW.format_map(defaultdict(lambda: math.nan, known))
-    return line.replace("nan%", "   -").replace("nan", "  -")
+def table_line(metrics):
+    """The printed line of an iteration; "-" for a metric that it does not have."""
+    cells = []
+    for _, width, name, form in COLUMNS:
+        value = metrics.get(name)
+        cell = "-" if value is None else format(value, form)
+        cells.append(cell.rjust(width))
+    return " ".join(cells)
 
 
 def show(run):
-    """Iterate a run, print a line for each iteration under a bar over the steps, and a summary."""
+    """Iterate over a run, and print a heading, a line for each iteration and a summary, with a
+    progress bar over the steps below."""
     coverage = run.algorithm.coverage
     config = run.algorithm.config
     name = run.settings["unit_name"]
     target = f"{coverage.full} {name} to cover" if coverage.full else "full coverage is unknown"
     say(
         f"{run.settings['method']}: {target}; seed {config.seed}; {config.steps:,} steps, "
-        f"{config.pretrain_steps:,} of them pretraining; run folder {run.folder}\n{HEADING}"
+        f"{config.pretrain_steps:,} of them pretraining; run folder {run.folder}"
     )
+    say(" ".join(heading.rjust(width) for heading, width, _, _ in COLUMNS))
     try:
         # disable=None: no bar where stderr is not a terminal
         disable = True if sys.stderr is None else None
@@ -2434,9 +2483,10 @@ def show(run):
         text = f"{coverage.steps:,} steps, {seconds:.0f} s: {len(coverage.visited())} {name}"
         if coverage.full:
             share = coverage.metrics()["coverage"]
-            text += f" of {coverage.full}, {share:.1%}; steps to "
-            marks = steps_to(coverage).items()
-            text += ", ".join(f"{m} %: {'not reached' if s is None else s}" for m, s in marks)
+            marks = []
+            for percent, step in steps_to(coverage).items():
+                marks.append(f"{percent} %: " + ("not reached" if step is None else f"{step:,}"))
+            text += f" of {coverage.full}, {share:.1%}; steps to {', '.join(marks)}"
         say(text)
 
 
@@ -2459,20 +2509,26 @@ def say(text, file=None):
         file.flush()
 
 
+MAKE_ROOM = "; make room, or choose another --out"
+CHOOSE_ANOTHER = "; choose an --out that can be written"
 HINTS = {  # what the user can do about an OSError
-    errno.ENOSPC: "make room, or choose another --out",
-    errno.EDQUOT: "make room, or choose another --out",
-    errno.ENOLCK: "choose an --out on a file system that has locks",
-    errno.EPIPE: "the reader of the output has ended; the run can be resumed",
-    None: "choose an --out that can be written",
+    errno.ENOSPC: MAKE_ROOM,
+    errno.EDQUOT: MAKE_ROOM,
+    errno.EACCES: CHOOSE_ANOTHER,
+    errno.EPERM: CHOOSE_ANOTHER,
+    errno.EROFS: CHOOSE_ANOTHER,
+    errno.ENOTDIR: CHOOSE_ANOTHER,
+    errno.EEXIST: CHOOSE_ANOTHER,
+    errno.ENOLCK: "; choose an --out on a file system that has locks",
+    errno.EPIPE: "; the reader of the output has ended; the run can be resumed",
 }
 
 
 def main(argv: list[str] | None = None) -> int:
     """The command line. Returns the exit code: 0; 1 if --verify finds a difference; 2 for what the
-    user can put right; 130 after Ctrl-C; 143 after SIGTERM."""
+    user can fix; 130 after Ctrl-C; 143 after SIGTERM."""
     if hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="backslashreplace")  # for names that its encoding lacks
+        sys.stdout.reconfigure(errors="backslashreplace")  # for characters that its encoding lacks
     try:
         with sigterm_as_interrupt(), warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: say(f"warning: {message}", sys.stderr)
@@ -2482,13 +2538,14 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         return interrupt.args[0] if interrupt.args else 130
     except OSError as error:
-        problem = (
-            f"{error.filename or 'a file'}: {error.strerror}; {HINTS.get(error.errno, HINTS[None])}"
-        )
+        problem = f"{error.filename or 'a file'}: {error.strerror}{HINTS.get(error.errno, '')}"
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        problem = "out of memory: choose smaller values of M, trajectory_steps, L or r_batch"
+        problem = (
+            "out of memory: choose smaller values of M, trajectory_steps, L, r_batch or, for rnd "
+            "and icm, rollout_steps"
+        )
     print(f"rbexplore: {problem}", file=sys.stderr)
     return 2
 
@@ -2552,26 +2609,21 @@ def run_command(args):
         except KeyboardInterrupt as interrupt:
             code = interrupt.args[0] if interrupt.args else 130
         if not args.no_figures:
-            say(f"{folder}: checkpoint.pt, config.json, metrics.csv, {figure_names(run)}")
+            try:
+                figures = ", ".join(draw(run))
+            except Exception as error:  # which must not hide that the run is finished
+                figures = f"but no figures ({type(error).__name__}: {error})"
+            say(f"{folder}: checkpoint.pt, config.json, metrics.csv, {figures}")
     if code:
         say(
             "stopped after the last complete iteration; to resume: "
-            f"python rbexplore.py --resume {folder}"
+            f"python rbexplore.py --resume {shlex.quote(str(folder))}"
         )
     return code
 
 
-def figure_names(run):
-    """Draw the figures and name them, or say why there are none: a figure that cannot be drawn must
-    not hide a finished run."""
-    try:
-        return ", ".join(draw(run))
-    except Exception as error:
-        return f"but no figures ({type(error).__name__}: {error})"
-
-
 def verify_command(args):
-    """Verify the run in a folder, and print a table. Returns the exit code."""
+    """Verify the run in a folder, and print a verdict for each cluster. Returns the exit code."""
     settings = recorded_settings(args, args.verify)
     if settings["method"] not in ("rbexplore", "cells"):
         raise InputError(f"{args.verify} is a run of {settings['method']}, which has no clusters")
