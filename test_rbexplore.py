@@ -1658,7 +1658,7 @@ def test_S6_1_13_R21_during_pretraining_theta_sim_rises_linearly_from_0():
     assert thresholds == pytest.approx([0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.7])
 
 
-def test_S6_1_13_states_join_by_the_threshold_of_their_iteration():
+def test_S6_1_13_R21_states_join_by_the_threshold_at_the_start_of_their_iteration():
     a = explorer(M=1, L=0, merge=False, pretrain_steps=400, theta_sim=0.5)
     a.similarity = Stub(lambda s, s_i: 0.3)
     walking(a, [0, *range(100, 200)])
@@ -1716,7 +1716,7 @@ def test_S6_1_15_R2_coverage_starts_at_the_restart():
 
 def test_S6_2_04_R2_iterations_are_whole_and_the_run_ends_with_the_one_that_spends_its_steps():
     """15 million steps"""
-    a = explorer(M=4, L=0, pretrain_steps=100, steps=250)
+    a = explorer(M=4, L=0, pretrain_steps=130, steps=250)
     a.similarity = Stub(tens)
     walking(a, range(31))
     a.run()
