@@ -21,7 +21,7 @@ import numpy as np
 
 
 class InputError(ValueError):
-    """Something that the user can put right. Its message is the one line that is shown."""
+    """Something that the user can fix. Its message is the one line that is shown."""
 
     def __init__(self, message: str):
         super().__init__(" ".join(message.split()))  # a quoted text may have several lines
@@ -31,7 +31,8 @@ class InputError(ValueError):
 
 
 class PersistentEnv(gymnasium.Env):
-    """A Gymnasium environment whose states can be saved and restored: a persistent MDP (3.2).
+    """A Gymnasium environment whose states can be saved and restored: a persistent MDP (section
+    3.2 of the paper).
 
     observation_space: a Box of uint8, (H, W) or (H, W, C) with C <= 4, channels last.
     action_space: Discrete, at most 256 actions. Rewards are ignored.
@@ -47,11 +48,11 @@ class PersistentEnv(gymnasium.Env):
     snapshot restores the counter, and the walks from late states are cut off. If it is not, the
     replay is not exact. Config.trajectory_steps limits the length of a trajectory.
 
-    Keep snapshots small. An iteration holds one for each of its states, which at 1 MB each and in
-    the paper's configuration makes 95 GB (M x trajectory_steps + L x additional_steps).
+    Keep snapshots small. An iteration holds one for each of its states: M x trajectory_steps + L x
+    additional_steps, which in the paper's configuration and at 1 MB each needs 95 GB.
     """
 
-    full_coverage: int | None = None  # number of units of full coverage (5), None if unknown
+    full_coverage: int | None = None  # number of units of full coverage; None if unknown
     unit_name = "units"  # what a unit is, printed beside every coverage (R26)
 
     def snapshot(self) -> bytes:
@@ -60,21 +61,21 @@ class PersistentEnv(gymnasium.Env):
 
     def restore(self, snapshot: bytes) -> np.ndarray:
         """Return to the state of `snapshot` without an environment step. Returns its observation.
+        The same actions then lead to the same frames and outcomes as before, in any process.
 
         Emulators do not restore the screen, and some renderers draw random numbers. In such a case,
         store the frame in the snapshot.
 
-        The same actions then lead to the same frames and outcomes as before, in any process.
         Raises InputError if the snapshot is malformed or of another environment.
         """
         raise NotImplementedError
 
     def unit(self) -> tuple | int | str | None:
-        """The coverage unit in which the agent is (5; see unit_key), or None."""
+        """The coverage unit in which the agent is (section 5; see unit_key), or None."""
         raise NotImplementedError
 
 
-METHODS = ("reset", "step", "snapshot", "restore", "unit", "close")
+CONTRACT = ("reset", "step", "snapshot", "restore", "unit", "close")
 
 
 def make_checked(env_fn: Callable[[], PersistentEnv], seed: int) -> PersistentEnv:
@@ -93,39 +94,39 @@ def check_contract(env: PersistentEnv, seed: int = 0, steps: int = 100) -> None:
     """Raise InputError, one line, unless `env` behaves as a persistent environment.
 
     A random walk of `steps` steps is recorded, with snapshots on the way. Then the snapshots are
-    restored in the reverse order, and the actions after each are repeated: everything must look as
-    it did before. Afterwards `env` is at s_init. Faults that show later, or only in another
+    restored in the reverse order, and the actions after each are repeated: frames, units and ends
+    must be the same. Afterwards `env` is at s_init. Faults that show later, or only in another
     process, are not found.
     """
     check_methods(env)
     check_spaces(env)
     rng = np.random.default_rng(0)
-    where = Moment(env)
-    start = where.reset(seed)
+    witness = Witness(env)
+    start = witness.reset(seed)
     seen = start
     parts = []  # of the walk: (steps before it, snapshot, what is seen, [(action, what is seen)])
-    while where.steps < steps:
-        part = (where.steps, where.snapshot(), seen, [])
+    while witness.steps < steps:
+        part = (witness.steps, witness.snapshot(), seen, [])
         parts.append(part)
         # Uneven lengths, so that a hidden clock is not right again by chance.
         for _ in range(rng.integers(5, 15)):
             action = int(env.action_space.start + rng.integers(env.action_space.n))
-            seen = where.step(action)
+            seen = witness.step(action)
             part[3].append((action, seen))
             if seen["terminated"] or seen["truncated"]:
-                seen = where.reset(seed)
+                seen = witness.reset(seed)
                 break
     for steps_before, snapshot, first, moves in reversed(parts):
-        where.steps = steps_before
-        where.compare("restore()", first, where.look("restore", where.call("restore", snapshot)))
+        witness.steps = steps_before
+        witness.compare("restore()", first, witness.restore(snapshot))
         for action, before in moves:
-            where.compare("the same action after a restore", before, where.step(action))
-    where.compare("reset() with the same seed", start, where.reset(seed))
+            witness.compare("the same action after a restore", before, witness.step(action))
+    witness.compare("reset() with the same seed", start, witness.reset(seed))
 
 
-class Moment:
-    """An environment at some step of the walk of check_contract. Every fault is an InputError that
-    names the step."""
+class Witness:
+    """Calls an environment for check_contract, and checks what it returns. Every fault is an
+    InputError that names the step of the walk."""
 
     def __init__(self, env):
         self.env = env
@@ -138,7 +139,7 @@ class Moment:
             self.refuse(f"{name}() fails with {type(error).__name__}: {error}")
 
     def refuse(self, problem):
-        raise InputError(f"the environment, after step {self.steps}: {problem}") from None
+        raise InputError(f"the environment, after step {self.steps}: {problem}")
 
     def reset(self, seed):
         result = self.call("reset", seed=seed)
@@ -164,6 +165,9 @@ class Moment:
                 self.refuse(f"step() returns {flag!r:.60} for {name}: it must be a bool")
             seen[name] = bool(flag)
         return seen
+
+    def restore(self, snapshot):
+        return self.look("restore", self.call("restore", snapshot))
 
     def snapshot(self):
         snapshot = self.call("snapshot")
@@ -207,7 +211,7 @@ def check_methods(env):
             f"{env!r:.80} is not an environment: give a function that makes the environment, "
             "so that calling it once returns an instance"
         )
-    missing = [name for name in METHODS if not callable(getattr(env, name, None))]
+    missing = [name for name in CONTRACT if not callable(getattr(env, name, None))]
     if missing:
         wrapped = isinstance(env, gymnasium.Wrapper)
         hint = "; use env.unwrapped, or add them to the wrapper" if wrapped else ""
@@ -217,7 +221,7 @@ def check_methods(env):
 
 
 def check_spaces(env):
-    """Raise InputError unless the spaces are as PersistentEnv says."""
+    """Raise InputError unless the spaces are as PersistentEnv requires."""
     actions = getattr(env, "action_space", None)
     if not isinstance(actions, gymnasium.spaces.Discrete) or actions.n > 256:
         raise InputError(
@@ -247,9 +251,9 @@ B = 6
 COLUMNS = 10  # tiles of a room, which is one screen
 ROWS = 3
 
-# A level is drawn in rooms of 10 x 3 tiles, apart by spaces.
+# A level is drawn in rooms of 10 x 3 tiles, separated by spaces.
 #   #  wall      _  floor       @  floor where the agent starts
-#   ^  spikes    .  open: no floor, one falls through
+#   ^  spikes    .  open: no floor, the agent falls through
 #   a  pressure plate, latched, opens every gate A
 #   A  gate, closed until its plate is pressed
 LEVELS = {
@@ -323,7 +327,7 @@ LUMINANCE = np.array([77, 150, 29], np.uint32)  # of red, green and blue, in 1/2
 FRAMES_KEPT = 4096
 
 
-class State(NamedTuple):
+class MazeState(NamedTuple):
     """The full state of a maze."""
 
     x: int  # tiles from the left of the level
@@ -336,10 +340,10 @@ class State(NamedTuple):
 class Maze(PersistentEnv):
     """A deterministic level of several rooms, of which the agent sees one; the reward is always 0.
 
-    LEFT and RIGHT turn the agent or, where it faces that way, run one tile.
-    A jumps two tiles ahead, over whatever is on the tile between.
+    LEFT and RIGHT turn the agent or, if it already faces that way, run one tile.
+    A jumps two tiles ahead, over whatever is on the tile between; a wall stops it.
     B steps one tile ahead, onto spikes without harm, and never over an edge.
-    UP climbs from under an opening to the floor beside it that the agent faces.
+    UP climbs, if an opening is above the agent, to the floor beside the opening that it faces.
     DOWN hangs from the edge ahead and lets go, which shortens the fall by one row.
     A fall of two rows or more kills, and so do spikes unless the agent steps on them with B.
 
@@ -367,11 +371,11 @@ class Maze(PersistentEnv):
         self.letters = sorted({tile for tile in drawing if tile.islower()})
         y = next(y for y, line in enumerate(self.tiles) if "@" in line)
         x = self.tiles[y].index("@")
-        self.start = State(x, y, facing=1, plates=0, dead=0)
+        self.start = MazeState(x, y, facing=1, plates=0, dead=0)
         self.state = self.start
         self.observation_space = gymnasium.spaces.Box(0, 255, (frame_size, frame_size), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(7)
-        self._seen: dict[State, np.ndarray] = {}  # frames of recent states
+        self._seen: dict[MazeState, np.ndarray] = {}  # frames of recent states
         self.full_coverage = len(self.reachable())
 
     def reset(self, *, seed=None, options=None):
@@ -446,12 +450,12 @@ class Maze(PersistentEnv):
             return "_" if self._pressed(tile, plates) else "#"
         return tile
 
-    def _next(self, state: State, action: int) -> State:
+    def _next(self, state: MazeState, action: int) -> MazeState:
         """The state after one action."""
         x, y, facing, plates, _ = state
         ahead = 1 if facing else -1
         tile_ahead = self._tile(x + ahead, y, plates)
-        hanging = 0  # rows by which the fall is shorter
+        hanging = 0  # rows by which hanging from the edge shortens the fall
         if action in (LEFT, RIGHT):
             wanted = int(action == RIGHT)
             if facing != wanted:
@@ -482,9 +486,9 @@ class Maze(PersistentEnv):
         impaled = arrived and tile == "^" and action != B
         if tile.islower():
             plates |= 1 << self.letters.index(tile)
-        return State(x, y, facing, plates, int(crushed or impaled))
+        return MazeState(x, y, facing, plates, int(crushed or impaled))
 
-    def _search(self, start: State) -> dict[State, int]:
+    def _search(self, start: MazeState) -> dict[MazeState, int]:
         """Breadth-first search: every state that can be reached from `start` -> steps to it."""
         steps = {start: 0}
         queue = [start]
@@ -498,10 +502,10 @@ class Maze(PersistentEnv):
                     queue.append(after)
         return steps
 
-    def _read(self, snapshot: bytes) -> State:
+    def _read(self, snapshot: bytes) -> MazeState:
         """The state of a snapshot. Raises InputError for another level or an impossible state."""
         if isinstance(snapshot, bytes) and len(snapshot) == 6 and snapshot[0] == self.level:
-            state = State(*snapshot[1:])
+            state = MazeState(*snapshot[1:])
             flags = state.facing < 2 and state.dead < 2
             known = state.plates < 2 ** len(self.letters)
             if flags and known and self._tile(state.x, state.y, state.plates) not in "#.":
@@ -517,14 +521,15 @@ class Maze(PersistentEnv):
         return self._seen[self.state].copy()
 
     def _draw(self):
-        """The luminance of the room, centred on black; in integers, the same on every machine."""
+        """The luminance of the room, centred on black. Integers: the same on every machine."""
         size = self.frame_size
         picture = self._picture(size // COLUMNS, size // ROWS)
         height, width, _ = picture.shape
         top = (size - height) // 2
         left = (size - width) // 2
         frame = np.zeros((size, size), np.uint8)
-        frame[top : top + height, left : left + width] = picture.astype(np.uint32) @ LUMINANCE >> 8
+        luminance = (picture.astype(np.uint32) @ LUMINANCE) >> 8
+        frame[top : top + height, left : left + width] = luminance
         return frame
 
     def _picture(self, w, h):
@@ -575,7 +580,7 @@ def paint_tile(box: np.ndarray, tile: str, pressed: bool) -> None:
         box[-thick:] = FLOOR
     if tile == "^":
         for i in range(w):
-            along = (2 * i + 1) / w % 1  # of one of the two teeth
+            along = (2 * i + 1) / w % 1  # position within one of the two teeth
             height = round(0.3 * h * (1 - abs(along * 2 - 1)))
             box[h - thick - height : h - thick, i] = STEEL
     elif tile.islower() and pressed:
@@ -589,7 +594,7 @@ def paint_tile(box: np.ndarray, tile: str, pressed: bool) -> None:
 
 
 def paint_agent(box: np.ndarray, facing: int, dead: int) -> None:
-    """Paint the agent into a tile, (h, w, 3) uint8, in place, above its floor and at its size."""
+    """Paint the agent into a tile, (h, w, 3) uint8, in place, above the floor, scaled to it."""
     drawing = DEAD if dead else ALIVE
     sprite = np.array([list(line) for line in drawing.split()])  # (12, 6)
     if not facing:
@@ -643,7 +648,7 @@ class EmulatorEnv(PersistentEnv):
         # Pillow computes in integers, so every machine agrees.
         size = self.observation_space.shape
         gray = Image.fromarray(self._screen()).convert("L")
-        return np.array(gray.resize(size, Image.Resampling.BILINEAR))  # which is antialiased
+        return np.array(gray.resize(size, Image.Resampling.BILINEAR))  # with antialiasing
 
     def _check_open(self):
         if self._emulator is None:
@@ -709,22 +714,22 @@ class PrinceOfPersia(EmulatorEnv):
 
     rom: the user's cartridge image, an iNES file.
     state: the gzip of an emulator state, as the authors publish them (level 1: in the sword's room
-    with the sword, 6.2). A state has no screen, so s_init comes one frame without buttons after it.
-    Without `state`, s_init is one second after power-on. This suits only a cartridge that is then
-    in play on `level`, because no action is START.
+    with the sword, 6.2). It holds no screen, so s_init is the state one frame later, without
+    buttons. Without `state`, s_init is one second after power-on: this suits only a cartridge that
+    is in play by then, because no action presses START.
     The clock is held at 99 minutes.
     info: level, room, x, y (pixels), hit_points, sword, blank.
 
     unit() is (room, x // 32, y // 32); None if the prince is dead, outside the room (left of it x
     wraps to 65535) or outside the level. %Cov is an estimate: FULL_COVERAGE counts the positions in
     the authors' reference data. We have their numbers but not the sets, so the units visited may
-    include others and outnumber them (744 of 721 on level 1); the share is cut at 1.
+    include others and outnumber them (744 of 721 on level 1); the share is at most 1.
 
     Raises InputError for an unusable file, a state of another level, a missing stable-retro, or a
     second emulator in the process.
     """
 
-    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # S5-02; no button is named NO-OP
+    ACTIONS = ("NO-OP", "LEFT", "RIGHT", "UP", "DOWN", "A", "B")  # S5-02
     # Units in the full coverage sets of levels 1 to 14, from the authors' reference data (R26).
     FULL_COVERAGE = (721, 723, 756, 706, 598, 287, 755, 736, 797, 444, 575, 688, 223, 107)
     LIVES = "hit_points"
@@ -747,7 +752,7 @@ class PrinceOfPersia(EmulatorEnv):
             start = gzip.decompress(Path(state).read_bytes()) if state else None
         except (OSError, EOFError, zlib.error) as error:
             raise InputError(f"cannot read the cartridge or start state: {error}") from None
-        if image[:4] != b"NES\x1a" or len(image) < 16 + 16384 * image[4]:
+        if image[:4] != b"NES\x1a" or len(image) < 16 or len(image) < 16 + 16384 * image[4]:
             raise InputError(f"{rom} is no complete NES cartridge image (iNES)")
         self.level = level
         self.full_coverage = self.FULL_COVERAGE[level - 1]
@@ -763,7 +768,7 @@ class PrinceOfPersia(EmulatorEnv):
             raise InputError(
                 "Prince of Persia needs stable-retro: pip install stable-retro"
             ) from None
-        # The core recognises the suffix .nes and reads the file once, so a temporary copy will do.
+        # A copy, because the core requires the suffix .nes. It reads the file only once.
         with tempfile.TemporaryDirectory() as folder:
             copy = Path(folder, "rom.nes")
             copy.write_bytes(image)
@@ -774,7 +779,7 @@ class PrinceOfPersia(EmulatorEnv):
                 raise InputError(f"the emulator refuses {rom}: {error}{hint}") from None
         self._data = stable_retro.data.GameData()
         self._emulator.configure_data(self._data)
-        buttons = stable_retro.get_system_info("Nes")["buttons"]
+        buttons = stable_retro.get_system_info("Nes")["buttons"]  # none is named NO-OP
         masks = [[button == action for button in buttons] for action in self.ACTIONS]
         self._masks = np.array(masks, np.uint8)
 
@@ -809,7 +814,7 @@ class PrinceOfPersia(EmulatorEnv):
     def _tick(self, action):
         self._emulator.set_button_mask(self._masks[action])
         self._emulator.step()
-        self._data.memory.assign(1221, "<u2", 0x3939)  # two digits, 9 and 9: the minutes left
+        self._data.memory.assign(1221, "<u2", 0x3939)  # the minutes left: "99" in ASCII
 
     def _ram(self):
         read = self._data.memory.extract
@@ -834,7 +839,7 @@ class Montezuma(EmulatorEnv):
     """Montezuma's Revenge through ale-py, which contains the game. Not in the paper.
 
     ALE/MontezumaRevenge-v5 without sticky actions (R22), and without its limit of 108,000 frames,
-    which rollbacks would reach. All 18 actions. The full coverage set is unknown.
+    which a run with rollbacks would exceed. All 18 actions. The full coverage set is unknown.
     info: room, x, y (ALE pixels), lives, blank.
     unit() is (room, column, row) in squares of 16 pixels, a tenth of the screen's width.
     """
@@ -915,8 +920,9 @@ def check_action(action: int, count: int) -> None:
 
 
 class Workers:
-    """An executor of concurrent.futures, or any object with its map(), whose workers each make the
-    environment once. They must be able to import this module, rbexplore and env_fn."""
+    """Walks in the workers of an executor of concurrent.futures, or of any object with its map().
+    Each worker makes the environment once; it must be able to import this module, rbexplore and
+    env_fn."""
 
     def __init__(self, executor: Executor, env_fn: Callable[[], PersistentEnv], seed: int):
         self.executor = executor
@@ -937,11 +943,11 @@ class Workers:
                 f"{DEFINE_IT_IN_A_MODULE}"
             ) from None
 
-    def map(self, function, *columns):
-        """function(env, ...) for each row of the columns, in order."""
+    def map(self, function, *arguments):
+        """function(env, *arguments) for each tuple of arguments, in order: like map()."""
         call = functools.partial(in_worker, self.key, self.env_fn, self.seed, function)
         try:
-            yield from self.executor.map(call, *columns)
+            yield from self.executor.map(call, *arguments)
         except BrokenExecutor as error:
             raise InputError(
                 f"a worker process died ({error}): it may have run out of memory, or could not "

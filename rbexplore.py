@@ -1935,7 +1935,7 @@ def curves_figure(groups, unit_name, pretrain_steps):
         low = curves.min(0)
         high = curves.max(0)
         panel.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-    panel.set_xlabel("agent steps (all that the method takes)")
+    panel.set_xlabel("agent steps")
     panel.set_ylabel(f"coverage, % of {full} {unit_name}" if full else f"coverage, {unit_name}")
     panel.set(xlim=(0, budget), ylim=(0, 102 if full else None))
     figure.legend(loc="outside upper center", ncols=4, fontsize=8)
