@@ -45,7 +45,6 @@ from envs import (
     InputError,
     Maze,
     Montezuma,
-    PersistentEnv,
     PrinceOfPersia,
     check_contract,
     make_env,
@@ -1547,7 +1546,7 @@ VALUES = [
     [row[1:] for row in VALUES],
     ids=[f"{row}_{name}" for row, name, _ in VALUES],
 )
-def test_the_papers_values_are_the_defaults(name, value):
+def test_S6_1_08_S6_1_09_S6_1_12_the_papers_values_are_the_defaults(name, value):
     assert getattr(Config(), name) == value
 
 
@@ -2414,6 +2413,7 @@ def test_S6_3_01_S6_3_03_runs_are_grouped_by_all_settings_but_the_seed(tmp_path)
 
 # The Prince of Persia cartridge cannot be shipped. These tests run a cartridge of our own in the
 # same emulator: its program, at the end of this section, keeps its readings at the same addresses.
+RAM = {"level": 112, "room": 1246, "x": 1243, "y": 1777, "hit_points": 1743, "sword": 1774}
 
 
 @pytest.fixture
@@ -2454,9 +2454,7 @@ def emulator(request):
 
 @pytest.fixture(params=["maze", "console", "montezuma"])
 def env(request):
-    if request.param == "maze":
-        return Maze(3)
-    return request.getfixturevalue(request.param)()
+    return Maze(3) if request.param == "maze" else request.getfixturevalue(request.param)()
 
 
 def memory(env):
@@ -2468,20 +2466,10 @@ def memory(env):
     return env.snapshot()
 
 
-RAM = {
-    "level": (112, "|u1"),
-    "room": (1246, "|u1"),
-    "x": (1243, "<u2"),
-    "y": (1777, "|u1"),
-    "hit_points": (1743, "|u1"),
-    "sword": (1774, "|u1"),
-}
-
-
 def put(env, **readings):
     """Write into the RAM of the cartridge, where level 1 is 0."""
     for name, value in readings.items():
-        env._data.memory.assign(*RAM[name], value)
+        env._data.memory.assign(RAM[name], "<u2" if name == "x" else "|u1", value)
 
 
 def start_state(env, path, level=1, room=14, x=77, y=192, hit_points=3):
@@ -2491,64 +2479,21 @@ def start_state(env, path, level=1, room=14, x=77, y=192, hit_points=3):
     return str(path)
 
 
-def play(env, actions):
-    """What is seen at each step, to the end of the episode: (frame, memory, unit, outcome)."""
-    seen = []
-    for action in actions:
+def play(env, frame, k):
+    """The last frame of the k-th walk of 8 random steps, and all that is seen on it."""
+    seen = [(frame.tobytes(), env.snapshot())]
+    for action in np.random.default_rng(k).integers(env.action_space.n, size=8).tolist():
         frame, *outcome = env.step(action)
         seen.append((frame.tobytes(), memory(env), env.unit(), outcome))
         if outcome[1]:
-            break
-    return seen
+            frame, _ = env.reset()
+    return frame, seen
 
 
-def replay(env, snapshot, actions):
-    frame = env.restore(snapshot)
-    return [(frame.tobytes(), memory(env), env.unit()), *play(env, actions)]
-
-
-def wander(env):
-    """Random walks, each from a state visited before: [(snapshot, actions)], and what was seen
-    when the snapshot was taken and from then on."""
-    rng = np.random.default_rng(0)
-    env.reset()
-    snapshots = [env.snapshot()]
-    walks = []
-    seen = []
-    for _ in range(40):
-        env.restore(snapshots[rng.integers(len(snapshots))])
-        actions = rng.integers(env.action_space.n, size=12).tolist()
-        here = play(env, actions[:4])[-1][:3]
-        if env.unit() is not None:
-            snapshots.append(env.snapshot())
-            walks.append((snapshots[-1], actions[4:]))
-            seen.append([here, *play(env, actions[4:])])
-    return walks, seen
-
-
-def test_S3_2_01_any_visited_state_can_be_loaded_at_any_time(env):
-    """3.2: "an environment property, that allows one to save and load states"."""
-    walks, seen = wander(env)
-    differing = []
-    for k in reversed(range(len(walks))):
-        snapshot, actions = walks[k]
-        loaded = replay(env, snapshot, actions)
-        env.restore(snapshot)
-        again = replay(env, env.snapshot(), actions)  # what was loaded can be saved
-        if [loaded, again] != [seen[k], seen[k]]:
-            differing.append(k)
-    assert differing == []
-
-
-def test_S3_2_01_every_state_of_the_maze_can_be_loaded():
-    env = Maze()
-    snapshots = list(env.distances(env.snapshot()))
-    differing = []
-    for k in np.random.default_rng(0).permutation(len(snapshots)):
-        env.restore(snapshots[k])
-        if env.snapshot() != snapshots[k]:
-            differing.append(snapshots[k])
-    assert differing == []
+def replay(env_fn, snapshots):
+    """What is seen on the walks when their starts are loaded, the last one first."""
+    env = env_fn()
+    return {k: play(env, env.restore(snapshots[k]), k)[1] for k in reversed(range(len(snapshots)))}
 
 
 @pytest.fixture(scope="module")
@@ -2558,20 +2503,29 @@ def elsewhere():
         yield pool
 
 
-def replay_all(make, walks):
-    env = make()
-    seen = [replay(env, snapshot, actions) for snapshot, actions in walks]
-    env.close()
-    return seen
-
-
-def test_S3_2_01_any_visited_state_can_be_loaded_in_another_process(env, elsewhere, tmp_path):
-    walks, seen = wander(env)
+def test_S3_2_01_any_visited_state_can_be_loaded_anywhere(env, elsewhere, tmp_path):
+    """3.2: "an environment property, that allows one to save and load states"; here in another
+    process, and in the reverse order."""
+    snapshots = []
+    walks = []
+    frame = env.reset()[0]
+    for k in range(40):
+        snapshots.append(env.snapshot())
+        frame, seen = play(env, frame, k)
+        walks.append(seen)
     options = {Maze: {"level": 3}, PrinceOfPersia: {"rom": str(tmp_path / "game.nes")}}
-    make = functools.partial(type(env), **options.get(type(env), {}))
-    there = elsewhere.submit(replay_all, make, walks).result()
-    assert [k for k in range(len(walks)) if there[k] != seen[k]] == []
-    assert len({step[0] for steps in seen for step in steps}) > 15  # pictures tell states apart
+    env_fn = functools.partial(type(env), **options.get(type(env), {}))
+    again = elsewhere.submit(replay, env_fn, snapshots).result()
+    assert [k for k in range(40) if again[k] != walks[k]] == []
+    assert len({step[0] for seen in walks for step in seen}) > 9  # pictures tell states apart
+
+
+def test_S3_2_01_all_of_a_state_is_loaded_and_the_dead_take_no_step(playground):
+    for state in ([4, 1, 0, 1, 3, 0], [4, 1, 0, 0, 0, 1]):  # both plates pressed; dead
+        playground.restore(bytes(state))
+        assert list(playground.snapshot()) == state
+    with pytest.raises(InputError, match="dead: reset or restore"):
+        playground.step(envs.NOOP)
 
 
 def test_S3_2_02_loading_a_state_costs_no_frame_of_the_emulator(emulator, monkeypatch):
@@ -2586,33 +2540,21 @@ def test_S3_2_02_loading_a_state_costs_no_frame_of_the_emulator(emulator, monkey
 
 
 def test_S3_2_03_every_cluster_of_a_game_is_reached_exactly(emulator):
-    a = make_method("cells", emulator, replace(TINY, steps=500, M=3, trajectory_steps=30)).run()
+    a = make_method("cells", emulator, replace(TINY, steps=150, pretrain_steps=0)).run()
     assert len(a.graph.clusters) > 3
     assert set(verify(a).values()) == {"exact"}
 
 
-def test_S5_01_an_observation_is_a_gray_picture_of_96_by_96(emulator):
+@pytest.mark.parametrize("options, size", [({}, 96), ({"frame_size": 40}, 40)])
+def test_S5_01_an_observation_is_the_screen_as_a_gray_picture(emulator, options, size):
     """5: "The input of the agent is a 96x96 grayscale image"."""
-    env = emulator()
-    frame = env.step(envs.RIGHT)[0]
-    assert env.observation_space == Box(0, 255, (96, 96), np.uint8)
-    assert Config().frame_size == 96
-    assert frame.shape == (96, 96)
-    assert frame.dtype == np.uint8
-
-
-@pytest.mark.parametrize("size", [96, 40])
-def test_S5_01_an_observation_is_the_screen_made_gray_and_smaller(emulator, size):
-    env = emulator(frame_size=size)
+    env = emulator(**options)
     frame = env.step(envs.RIGHT)[0]
     prince = isinstance(env, PrinceOfPersia)
     screen = env._emulator.get_screen() if prince else env._emulator.getScreenRGB()
     picture = Image.fromarray(screen).convert("L").resize((size, size), Image.Resampling.BILINEAR)
+    assert env.observation_space == Box(0, 255, (size, size), np.uint8)
     assert np.argwhere(frame != np.array(picture)).tolist() == []
-    gray = screen @ np.array([0.299, 0.587, 0.114])
-    for i, j in np.ndindex(2, 2):  # each quarter keeps its brightness
-        quarters = [np.split(np.split(p, 2, axis=0)[i], 2, axis=1)[j] for p in (frame, gray)]
-        assert quarters[0].mean() == pytest.approx(quarters[1].mean(), abs=2)
 
 
 def test_S5_02_seven_actions_are_seven_states_of_the_joystick(prince):
@@ -2623,12 +2565,9 @@ def test_S5_02_seven_actions_are_seven_states_of_the_joystick(prince):
         prince.step(action)
         pressed.append(buttons.get(memory(prince)[1]))  # RAM 1: the pad as the game reads it
     assert pressed == ["", "left", "right", "up", "down", "A", "B"]
-
-
-def test_S5_02_the_maze_has_the_same_seven_actions(prince):
+    names = [envs.NOOP, envs.LEFT, envs.RIGHT, envs.UP, envs.DOWN, envs.A, envs.B]
+    assert names == [0, 1, 2, 3, 4, 5, 6]
     assert Maze().action_space == prince.action_space
-    names = (envs.NOOP, envs.LEFT, envs.RIGHT, envs.UP, envs.DOWN, envs.A, envs.B)
-    assert names == (0, 1, 2, 3, 4, 5, 6)
 
 
 def test_S5_03_the_full_coverage_of_each_level(console, tmp_path):
@@ -2640,70 +2579,59 @@ def test_S5_03_the_full_coverage_of_each_level(console, tmp_path):
     assert counts == [721, 723, 756, 107]
 
 
-def test_S5_03_the_full_coverage_of_the_maze_is_every_tile_that_steps_reach():
-    env = Maze()
-    snapshots = [env.snapshot()]
-    units = {env.unit()}
-    for snapshot in snapshots:  # which grows meanwhile
+def test_S5_03_the_full_coverage_of_the_maze_is_every_tile_that_is_reached_alive(playground):
+    snapshots = [playground.snapshot()]
+    units = {playground.unit()}
+    for snapshot in snapshots:  # grows during the loop
         for action in range(7):
-            env.restore(snapshot)
-            dead = env.step(action)[2]
-            if not dead and env.snapshot() not in snapshots:
-                units.add(env.unit())
-                snapshots.append(env.snapshot())
-    assert units ^ env.reachable() == set()
-    assert env.full_coverage == len(units)
+            playground.restore(snapshot)
+            dead = playground.step(action)[2]
+            if not dead and playground.snapshot() not in snapshots:
+                units.add(playground.unit())
+                snapshots.append(playground.snapshot())
+    assert units ^ playground.reachable() == set()
+    assert playground.full_coverage == len(units)
 
 
-def test_S5_03_where_nobody_arrives_alive_is_no_part_of_full_coverage(monkeypatch):
-    pit = ["@_.#######", "##.#######", "##.#######", "##_#######", "##########", "##########"]
-    monkeypatch.setitem(envs.LEVELS, 4, "\n".join(pit))
-    assert Maze(4).reachable() == {(0, 0, 0), (0, 1, 0)}
-
-
-def test_S5_04_a_unit_is_the_space_above_a_plate(prince):
+def test_S5_04_R26_a_unit_is_the_space_above_a_plate(prince):
     """5: "the area that roughly corresponds to space above the plate"; R26: 32 x 32 pixels."""
-    units = []
-    for x, y in ((64, 128), (95, 159), (63, 128), (96, 128), (64, 160)):
-        put(prince, x=x, y=y)
-        units.append(prince.unit())
-    assert units == [(14, 2, 4), (14, 2, 4), (14, 1, 4), (14, 3, 4), (14, 2, 5)]
-    put(prince, room=15)
-    assert prince.unit() == (15, 2, 5)
-    assert prince.unit_name == "units of 32 x 32 pixels"
-
-
-def test_S5_04_outside_the_room_or_dead_there_is_no_unit(prince):
-    inside = {(0, 32): (0, 0, 1), (332, 32): (0, 10, 1), (0, 223): (0, 0, 6)}
-    for x, y in (*inside, (333, 32), (65535, 32), (0, 31), (0, 224)):
-        put(prince, room=0, x=x, y=y)
-        assert prince.unit() == inside.get((x, y)), (x, y)
-    put(prince, x=0, y=32, hit_points=0)
+    expected = {
+        (64, 128): (14, 2, 4), (95, 159): (14, 2, 4), (63, 128): (14, 1, 4), (64, 160): (14, 2, 5),
+        (0, 32): (14, 0, 1), (332, 32): (14, 10, 1), (0, 223): (14, 0, 6),  # the room's corners
+        (333, 32): None, (65535, 32): None, (0, 31): None, (0, 224): None,  # outside
+    }  # fmt: skip
+    units = {}
+    for x, y in expected:
+        put(prince, x=x, y=y, hit_points=1)
+        units[x, y] = prince.unit()
+    assert units == expected
+    put(prince, room=15, x=64, y=128)
+    assert prince.unit() == (15, 2, 4)
+    put(prince, hit_points=0)
     assert prince.unit() is None
+    assert prince.unit_name == "units of 32 x 32 pixels"
+    assert Maze(2).full_coverage == 258  # its rooms are distinct
 
 
 def test_S6_1_01_a_step_is_four_frames_of_one_action(prince):
-    """6.1: "applying a frameskip of 4 frames"."""
-    start = memory(prince)[0]  # RAM 0 counts frames; 512 + frame keeps the pad
-    prince.step(envs.A)
-    ram = memory(prince)
-    assert ram[0] - start == 4
-    assert list(ram[512 + start : 512 + start + 4]) == [128, 128, 128, 128]
+    """6.1: "applying a frameskip of 4 frames". The cartridge runs 4 pixels a frame."""
+    positions = [prince.reset()[1]["x"], prince.step(envs.RIGHT)[4]["x"]]
+    assert positions == [64, 80]
 
 
 @pytest.mark.parametrize("options, count", [({}, 4), ({"frameskip": 7}, 7)])
 def test_S6_1_01_a_step_leads_as_far_as_steps_of_one_frame(emulator, options, count):
-    actions = 8 * [envs.RIGHT, envs.DOWN, envs.A, envs.UP, envs.LEFT]
+    actions = 4 * [envs.RIGHT, envs.DOWN, envs.A, envs.UP, envs.LEFT]
     env = emulator(frameskip=1)
     frames = [[env.step(action)[0].tobytes() for _ in range(count)] for action in actions]
     env = emulator(**options)
     seen = [env.step(action)[0].tobytes() for action in actions]
-    assert [k for k in range(40) if seen[k] != frames[k][-1]] == []
-    assert [k for k in range(40) if seen[k] != frames[k][-2]] != []
+    assert [k for k in range(20) if seen[k] != frames[k][-1]] == []
+    assert [k for k in range(20) if seen[k] != frames[k][-2]] != []
 
 
 def test_S6_1_07_the_loss_of_a_hit_point_ends_the_episode(prince):
-    """6.1: "Episodes are terminated on the loss of life". A hurts, on the lowest floor."""
+    """6.1: "Episodes are terminated on the loss of life". On the lowest floor, A hurts."""
     assert prince.step(envs.A)[2] is False
     put(prince, y=200)
     _, _, terminated, truncated, info = prince.step(envs.A)
@@ -2716,40 +2644,35 @@ def test_S6_1_07_the_loss_of_a_life_ends_the_episode_in_montezuma(montezuma):
     env = montezuma()
     lives = [5]
     ended = []
-    for action in np.random.default_rng(0).integers(18, size=400).tolist():
+    for action in np.random.default_rng(0).integers(18, size=300).tolist():
         _, _, terminated, _, info = env.step(action)
         lives.append(info["lives"])
         ended.append(terminated)
-    assert ended == [lives[k + 1] < lives[k] for k in range(400)]
+    assert ended == (np.diff(lives) < 0).tolist()
     assert sum(ended) > 0
 
 
-def test_S6_2_01_level_1_starts_at_the_sword_holding_it(console, tmp_path):
-    """6.2: it "starts the first level with the sword [...] where the sword is located"."""
-    state = start_state(console(), tmp_path / "state", level=1, room=14, x=77, y=192)
-    env = console(level=1, state=state)
-    env.step(envs.UP)
-    position = {"level": 1, "room": 14, "x": 77, "y": 192}
-    assert env.reset()[1] == {**position, "hit_points": 3, "sword": 1, "blank": False}
-
-
-@pytest.mark.parametrize("level, room, x, y", [(2, 4, 123, 128), (3, 8, 164, 192)])
-def test_S6_2_02_levels_2_and_3_start_unchanged(console, tmp_path, level, room, x, y):
-    """6.2: "For the other levels, we did not make any changes to the initial state"."""
+@pytest.mark.parametrize("level, room, x", [(1, 14, 77), (2, 4, 123), (3, 8, 300)])
+def test_S6_2_01_S6_2_02_a_level_starts_as_its_start_state(console, tmp_path, level, room, x):
+    """6.2: "starts the first level with the sword [...] where the sword is located. For the other
+    levels, we did not make any changes to the initial state"."""
     env = console()
-    state = start_state(env, tmp_path / "state", level, room, x, y)
+    state = start_state(env, tmp_path / "state", level, room, x, y=200)
     before = memory(env)
-    env = console(HALTING, level=level, state=state)  # whose program changes nothing
-    assert memory(env).hex() == before.hex()
-    assert env.reset()[1]["level"] == level
-    assert env.unit() == (room, x // 32, y // 32)
+    env = console(level=level, state=state)
+    env.step(envs.RIGHT)
+    expected = {"level": level, "room": room, "x": x, "y": 192, "hit_points": 3, "sword": 1}
+    assert env.reset()[1] == {**expected, "blank": False}
+    after = memory(env)
+    assert after[0] == before[0] + 1  # the one frame that makes a picture
+    assert after[1:].hex() == before[1:].hex()
 
 
 def test_R22_the_observation_is_the_last_frame_of_its_step(prince):
     """R22: no maximum over frames. Six frames are black: the 4th to the 9th."""
-    put(prince, x=324)
-    brightest = [prince.step(action)[0].max() for action in (envs.RIGHT, envs.NOOP, envs.NOOP)]
-    assert [value > 0 for value in brightest] == [False, False, True]
+    put(prince, x=244)
+    black = [not prince.step(action)[0].any() for action in (envs.RIGHT, envs.NOOP, envs.NOOP)]
+    assert black == [True, True, False]
 
 
 def test_R22_actions_are_not_sticky(montezuma):
@@ -2757,128 +2680,86 @@ def test_R22_actions_are_not_sticky(montezuma):
 
 
 def test_R23_any_loss_of_hit_points_or_another_level_ends_the_trajectory(prince):
-    """R23: the loss is counted within the step, whatever was lost before it."""
+    """R23: the loss is counted within the step, whatever was lost before it. B heals."""
     put(prince, hit_points=2)
-    assert prince.step(envs.A)[2] is False
-    put(prince, y=40)
-    _, _, terminated, _, info = prince.step(envs.B)  # through the exit
-    assert info["level"] == 2
-    assert info["hit_points"] == 2
-    assert terminated is True
+    seen = []
+    for level, y, action in ((0, 128, envs.A), (0, 200, envs.A), (0, 200, envs.B), (1, 128, 0)):
+        put(prince, level=level, y=y)
+        _, _, terminated, _, info = prince.step(action)
+        seen.append((info["level"], info["hit_points"], terminated))
+    assert seen == [(1, 2, False), (1, 1, True), (1, 2, False), (2, 2, True)]
     assert prince.unit() is None
 
 
-def test_R23_more_hit_points_do_not_end_the_trajectory(console):
-    prince = console(cartridge(PROGRAM.replace("dec 1743", "inc 1743")))
-    put(prince, y=200)
-    _, _, terminated, _, info = prince.step(envs.A)
-    assert info["hit_points"] == 4
-    assert terminated is False
-
-
-def test_R24_a_black_screen_is_marked_as_blank(prince):
-    """R24: between two rooms the screen is black for six frames."""
-    put(prince, x=330)
-    frame, _, _, _, info = prince.step(envs.RIGHT)
-    assert info["room"] == 15
-    assert frame.max() == 0
-    assert info["blank"] is True
-    assert prince.step(envs.NOOP)[4]["blank"] is False
-
-
-def test_R24_a_dark_screen_is_not_blank(console):
-    prince = console(cartridge(PROGRAM.replace("lda# 15", "lda# 45")))  # dark gray
-    put(prince, x=330)
+@pytest.mark.parametrize("colour, blank", [(15, True), (45, False)])  # black, dark gray
+def test_R24_a_black_screen_is_marked_as_blank(console, colour, blank):
+    """R24: between two rooms the screen is black for six frames. Other screens are so in part."""
+    prince = console(cartridge(PROGRAM.replace("lda# 15", f"lda# {colour}")))
+    put(prince, x=252)
     frame, _, _, _, info = prince.step(envs.RIGHT)
     assert np.ptp(frame) == 0
-    assert info["blank"] is False
-
-
-def test_R24_a_screen_that_is_black_in_part_is_not_blank(montezuma):
-    frame, info = montezuma().reset()
+    assert info["blank"] is blank
+    frame, _, _, _, info = prince.step(envs.NOOP)
     assert frame.min() == 0
     assert info["blank"] is False
 
 
-# The program of the stand-in cartridge.
-# The suffix of an operation is its addressing: # immediate, z zero page, x indexed by X.
-OPCODES = dict(
-    re.findall(
-        r"(\S+) (\d+)",
-        """
-    adc# 105  and# 41  bcc 144  bcs 176  beq 240  bit 44  bne 208  bpl 16  clc 24  cmp# 201  dec 206
-    decz 198  dex 202  dey 136  inc 238  incz 230  inx 232  jmp 76  lda 173  lda# 169  ldax 189
-    ldaz 165  ldx# 162  ldxz 166  ldy# 160  lsr 74  rolz 38  sbc# 233  sec 56  sei 120  sta 141
-    stax 157  staz 133  txa 138""",
-    )
-)
-# RAM 0 counts frames, 1 is the pad, 2 counts black frames; 512 + frame keeps the pad, 768 + frame
-# the clock. Right of x = 332 is the next room, after 6 black frames. A below y = 160 hurts; B takes
-# the sword, and above y = 64 the exit. The picture is noise, scrolled by x and y, in the room's
-# colour.
+# The program of the cartridge. RAM 0 counts frames, RAM 1 is the pad. RIGHT moves x; behind x = 255
+# is the next room, after 6 black frames. Below y = 160, A takes a hit point every fourth frame and
+# B adds one. The picture is noise, scrolled by x and y, before the room's colour.
 PROGRAM = """
-    sei | ldx# 0 | txa
+    lda# 0 | ldx# 0
   clear: stax 0 | stax 1024 | stax 1536 | inx | bne clear
-  warm1: bit 8194 | bpl warm1
-  warm2: bit 8194 | bpl warm2
-    sta 8198 | sta 8198 | ldx# 16
-  empty: sta 8199 | dex | bne empty
-    lda# 32 | sta 8198 | lda# 0 | sta 8198 | ldx# 0 | ldy# 4
-  noise: ldax 49152 | and# 1 | sta 8199 | inx | bne noise | dey | bne noise
-    lda# 3 | sta 1743 | lda# 64 | sta 1243 | lda# 128 | sta 1777 | lda# 14 | sta 1246
-    lda# 53 | sta 1221 | lda# 57 | sta 1222
-  frame: bit 8194 | bpl frame
-    lda# 63 | sta 8198 | lda# 0 | sta 8198 | ldaz 2 | beq lit
-    decz 2 | lda# 15 | sta 8199 | lda# 0 | jmp drawn
-  lit: lda 1246 | and# 7 | clc | adc# 1 | sta 8199
-    lda# 48 | sta 8199 | sta 8199 | sta 8199 | lda# 10
-  drawn: sta 8193 | lda# 0 | sta 8192 | lda 1243 | sta 8197 | lda 1777 | sta 8197
-    lda# 1 | sta 16406 | lda# 0 | sta 16406 | ldx# 8
-  pad: lda 16406 | lsr | rolz 1 | dex | bne pad
-    ldxz 0 | ldaz 1 | stax 512 | lda 1222 | stax 768 | incz 0 | dec 1222
-    ldaz 1 | and# 1 | beq left
-    lda 1243 | clc | adc# 4 | sta 1243 | lda 1244 | adc# 0 | sta 1244 | cmp# 1 | bne left
-    lda 1243 | cmp# 77 | bcc left
-    lda# 0 | sta 1243 | sta 1244 | inc 1246 | lda# 6 | staz 2
-  left: ldaz 1 | and# 2 | beq down
-    lda 1243 | sec | sbc# 4 | sta 1243 | lda 1244 | sbc# 0 | sta 1244
-  down: ldaz 1 | and# 4 | beq up | lda 1777 | clc | adc# 4 | sta 1777
-  up: ldaz 1 | and# 8 | beq slow | lda 1777 | sec | sbc# 4 | sta 1777
-  slow: ldaz 0 | and# 3 | bne end
-    ldaz 1 | and# 128 | beq b | lda 1777 | cmp# 160 | bcc b | dec 1743
-  b: ldaz 1 | and# 64 | beq end | lda# 1 | sta 1774 | lda 1777 | cmp# 64 | bcs end | incz 112
+    lda# 14 | sta room | lda# 64 | sta x | lda# 128 | sta y | lda# 3 | sta hit_points
+    lda# 53 | sta clock | lda# 0 | sta address | sta address | ldx# 16
+  empty: sta data | dex | bne empty
+    lda# 32 | sta address | lda# 0 | sta address | ldx# 0 | ldy# 4
+  noise: ldax 49152 | and# 1 | sta data | inx | bne noise | dey | bne noise
+  frame: lda status | bpl frame
+    lda# 63 | sta address | lda# 0 | sta address | lda black | beq lit
+    dec black | lda# 15 | sta data | lda# 0 | jmp drawn
+  lit: lda room | and# 7 | ora# 32 | sta data | lda# 29 | sta data | sta data | sta data | lda# 10
+  drawn: sta mask | lda# 0 | sta control | lda x | sta scroll | lda y | sta scroll
+    lda# 1 | sta port | lda# 0 | sta port | ldx# 8
+  buttons: lda port | lsr | rol pad | dex | bne buttons
+    inc frames | dec clock | lda pad | and# 1 | beq floor
+    lda x | clc | adc# 4 | sta x | bcc floor | inc room | lda# 6 | sta black
+  floor: lda frames | and# 3 | bne end | lda y | cmp# 160 | bcc end
+    lda pad | and# 128 | beq heal | dec hit_points
+  heal: lda pad | and# 64 | beq end | inc hit_points
   end: jmp frame
 """
-ORIGIN = 49152  # the address of the program, in the last bank
-HEADER = b"NES\x1a\x08\0\x20".ljust(16, b"\0")  # iNES, 8 banks of 16 KiB, mapper 2
-HALTING = HEADER + b"\2" * 8 * 16384  # every operation halts, so RAM stays as it is
+# The suffix of an operation is its addressing: # immediate, x indexed by X.
+OPCODES = {
+    "adc#": 105, "and#": 41, "bcc": 144, "beq": 240, "bne": 208, "bpl": 16, "clc": 24, "cmp#": 201,
+    "dec": 206, "dex": 202, "dey": 136, "inc": 238, "inx": 232, "jmp": 76, "lda": 173, "lda#": 169,
+    "ldax": 189, "ldx#": 162, "ldy#": 160, "lsr": 74, "ora#": 9, "rol": 46, "sta": 141, "stax": 157,
+}  # fmt: skip
+ADDRESSES = RAM | {
+    "frames": 0, "pad": 1, "black": 2, "clock": 1222, "control": 8192, "mask": 8193,
+    "status": 8194, "scroll": 8197, "address": 8198, "data": 8199, "port": 16406,
+}  # fmt: skip
+ORIGIN = 49152  # the address of the program
 
 
-def assemble(program):
-    """The bytes of a program, in two passes: the first finds the labels."""
-    labels = {}
-    for _ in range(2):
+def cartridge(program=PROGRAM):
+    """A cartridge image (iNES, mapper 2): one bank of 16 KiB."""
+    labels = dict(ADDRESSES)
+    for _ in range(2):  # the first pass finds the labels
         code = b""
         for line in re.split(r"[|\n]", program.strip()):
             label, _, operation = line.rpartition(":")
             labels[label.strip()] = ORIGIN + len(code)
             name, *operand = operation.split()
-            code += bytes([int(OPCODES[name])])
+            code += bytes([OPCODES[name]])
             for text in operand:
                 value = int(text) if text.isdigit() else labels.get(text, ORIGIN)
-                branch = re.fullmatch("b[^i].", name)
+                branch = name.startswith("b")
                 if branch:
-                    code += bytes([value - ORIGIN - len(code) - 1 & 255])
-                else:
-                    code += value.to_bytes(1 if name[-1] in "#z" else 2, "little")
-    return code
-
-
-def cartridge(program=None, mark=0):
-    """A cartridge image of 128 KiB; `mark` fills the unused banks."""
+                    value = (value - ORIGIN - len(code) - 1) % 256
+                code += value.to_bytes(1 if branch or name.endswith("#") else 2, "little")
     vectors = 3 * ORIGIN.to_bytes(2, "little")
-    last_bank = assemble(program or PROGRAM).ljust(16378, b"\0") + vectors
-    return HEADER + bytes([mark]) * 7 * 16384 + last_bank
+    return b"NES\x1a\1\0\x20".ljust(16, b"\0") + code.ljust(16378, b"\0") + vectors
 
 
 # ##################################################################################################
@@ -2909,32 +2790,9 @@ def variant(**members):
     return type("Variant", (Clocked,), members)()
 
 
-def framed(*shape, dtype=np.uint8):
-    """Frames of this kind."""
-    return variant(observation_space=Box(0, 255, shape, dtype))
-
-
 def stepping(change):
     """step() returns something else."""
     return variant(step=lambda env, action: change(env, *Clocked.step(env, action)))
-
-
-def showing(number, **members):
-    """Two pixels of the frames show a number."""
-
-    def picture(env):
-        picture = Grid.picture(env)
-        picture[30, 30:32] = number(env) % 256
-        return picture
-
-    return variant(picture=picture, **members)
-
-
-def one_array(env):
-    """Every frame is the same array. It shows the clock."""
-    env.array = getattr(env, "array", np.zeros((32, 32), np.uint8))
-    env.array[:] = env.clock
-    return env.array
 
 
 def restore_in_order(env, snapshot):
@@ -2945,100 +2803,56 @@ def restore_in_order(env, snapshot):
     return Grid.restore(env, snapshot)
 
 
-def fail(env, *_):
-    raise RuntimeError("over\ntwo lines")
-
-
-@pytest.mark.parametrize(
-    "env",
-    [
-        variant(unit=lambda env: None),
-        variant(action_space=Discrete(256)),
-        variant(
-            action_space=Discrete(2, start=5),
-            step=lambda env, action: Clocked.step(env, [5, 6].index(action)),
-        ),
-        framed(32, 32, 4),
-        stepping(lambda env, frame, *_: (frame, 0.0, env.place == (4, 0), False, {})),
-        stepping(lambda env, frame, *_: (frame, 0.0, np.bool_(0), np.bool_(0), {})),
-    ],
-)
+@pytest.mark.parametrize("env", [
+    variant(unit=lambda env: None),
+    variant(action_space=Discrete(2, start=5),
+            step=lambda env, action: Clocked.step(env, [5, 6].index(action))),
+    variant(action_space=Discrete(256), observation_space=Box(0, 255, (32, 32, 4), np.uint8)),
+    stepping(lambda env, frame, *_: (frame, 0.0, np.bool_(env.place == (4, 0)), False, {})),
+])  # fmt: skip
 def test_the_contract_accepts_an_honest_environment_and_leaves_it_at_s_init(env):
     check_contract(env, seed=5)
     assert env.place == (0, 0)
     assert set(env.seeds) == {5}
 
 
-def test_the_contract_accepts_the_maze_and_the_emulators(env):
-    env.reset()
-    before = memory(env)
-    check_contract(env)
-    assert memory(env).hex() == before.hex()
-
-
-REFUSED = {
-    "is not an environment: give a function that makes": Grid,
-    "makes the environment, so that calling it once returns": functools.partial(Grid),
-    "lacks reset, step, snapshot, restore, unit, close(), see PersistentEnv": None,
-    "lacks snapshot(), see PersistentEnv in envs.py": variant(snapshot=None),
-    "use env.unwrapped, or add them to the wrapper": gymnasium.wrappers.TimeLimit(Grid(), 9),
-    "the action space is Box": variant(action_space=Box(0, 1)),
-    "at most 256 actions": variant(action_space=Discrete(257)),
-    "must be a Box of uint8": framed(32, 32, dtype=np.float32),
-    "the observation space is Discrete(3)": variant(observation_space=Discrete(3)),
-    "(H, W) or (H, W, C)": framed(8),
-    "frames are (3, 64, 64): channels come last": framed(3, 64, 64),
-    "frames are (9, 9, 5): channels come last": framed(9, 9, 5),
-    "after step 0: reset() fails with TypeError": variant(reset=lambda env: None),
-    "reset() must return a frame and a dict": variant(reset=lambda env, seed: Grid.reset(env)[0]),
-    "reset() must return a frame": variant(reset=lambda env, seed: (Grid.reset(env)[0], None)),
-    "reset() returns a list as the frame, not": variant(picture=lambda env: [[0] * 32] * 32),
-    "frame (2, 2) of float64: the observation space says (32, 32) of uint8": variant(
-        picture=lambda env: np.zeros((2, 2))
-    ),
-    "frame (32, 32) of int64": variant(picture=lambda env: np.zeros((32, 32), int)),
-    "after step 1: step() returns a frame (31, 32) of uint8": stepping(
-        lambda env, frame, *rest: (frame[1:], *rest)
-    ),
-    "after step 0: snapshot() returns [1]": variant(snapshot=lambda env: [1]),
-    "after step 0: snapshot() returns b''": variant(snapshot=lambda env: b""),
-    "after step 0: unit() fails with NotImplementedError": variant(unit=PersistentEnv.unit),
-    "after step 0: unit() returns ('cave', 0.5)": variant(unit=lambda env: ("cave", 0.5)),
-    "after step 1: step() fails with RuntimeError: over two lines": variant(step=fail),
-    "after step 1: step() must return frame, reward, ": stepping(lambda env, *result: result[:4]),
-    "terminated, truncated, and a dict": stepping(lambda env, *result: (*result[:4], None)),
-    "returns 0 for terminated": stepping(lambda env, frame, *_: (frame, 0.0, 0, False, {})),
-    "returns None for truncated": stepping(lambda env, frame, *_: (frame, 0.0, False, None, {})),
-    "returns 1 for blank": stepping(lambda env, *result: (*result[:4], {"blank": 1})),
-    "restore() fails with RuntimeError": variant(restore=fail),
-    "restore() returns a tuple as the frame": variant(restore=lambda env, _: (env.picture(), {})),
-    "restore() leads to a different frame than the first time": variant(
-        restore=lambda env, snapshot: (env.picture(), Grid.restore(env, snapshot))[0]
-    ),
-    "reset() with the same seed leads to a different frame": showing(lambda env: len(env.seeds)),
-    "restore() leads to a different frame": showing(lambda env: env.clock),
-    "restore() leads to a different": variant(picture=one_array),
-    "leads to a different frame": showing(
-        lambda env: env.clock, restored=False, restore=restore_in_order
-    ),
-    "restore() leads to a different unit": variant(unit=lambda env: env.clock),
-    "the same action after a restore leads to a different terminated": stepping(
-        lambda env, *result: (*result[:2], env.clock == 96, *result[3:])
-    ),
-    "the same action after a restore leads to a different truncated": stepping(
-        lambda env, *result: (*result[:3], env.clock == 96, *result[4:])
-    ),
-    "the same action after a restore leads to a different blank": stepping(
-        lambda env, *result: (*result[:4], {"blank": env.clock % 10 == 0})
-    ),
-}
-
-
-@pytest.mark.parametrize("said", REFUSED)
-def test_the_contract_refuses_in_one_line(said):
-    with pytest.raises(InputError, match=re.escape(said)) as error:
-        check_contract(REFUSED[said])
-    assert len(str(error.value).splitlines()) == 1
+@pytest.mark.parametrize("env, said", [
+    (Grid, "is not an environment: give a function that makes"),
+    (functools.partial(Grid), "so that calling it once returns an instance"),
+    (None, "lacks reset, step, snapshot, restore, unit, close(), see PersistentEnv in envs.py"),
+    (variant(snapshot=None), "lacks snapshot(), see"),
+    (gymnasium.wrappers.TimeLimit(Grid(), 9), "use env.unwrapped, or add them to the wrapper"),
+    (variant(action_space=Box(0, 1)), "the action space is Box"),
+    (variant(action_space=Discrete(257)), "at most 256 actions"),
+    (variant(observation_space=Box(0, 255, (32, 32), np.float32)), "must be a Box of uint8"),
+    (variant(observation_space=Box(0, 255, (8,), np.uint8)), "(H, W) or (H, W, C)"),
+    (variant(observation_space=Box(0, 255, (9, 9, 5), np.uint8)), "channels come last, (H, W, C)"),
+    (variant(reset=lambda env, seed: Grid.reset(env)[0]), "reset() must return a frame and a dict"),
+    (variant(reset=lambda env, seed: (Grid.reset(env)[0], 0)), "reset() must return a frame"),
+    (variant(picture=lambda env: [[0] * 32] * 32), "reset() returns a list as the frame, not"),
+    (variant(picture=lambda env: np.zeros((32, 32))), "frame (32, 32) of float64"),
+    (variant(snapshot=lambda env: [1]), "after step 0: snapshot() returns [1]"),
+    (variant(snapshot=lambda env: b""), "after step 0: snapshot() returns b''"),
+    (variant(unit=lambda env: 0.5), "after step 0: unit() returns 0.5"),
+    (variant(step=lambda env, action: 1 / 0), "after step 1: step() fails with ZeroDivisionError"),
+    (stepping(lambda env, *result: result[:4]), "after step 1: step() must return frame, reward"),
+    (stepping(lambda env, *result: (*result[:4], None)), "terminated, truncated, and a dict"),
+    (stepping(lambda env, frame, *rest: (frame[1:], *rest)), "step() returns a frame (31, 32)"),
+    (stepping(lambda env, *result: (*result[:2], 0, False, {})), "returns 0 for terminated"),
+    (variant(restore=lambda env, _: env.picture()), "restore() leads to a different frame than"),
+    (variant(unit=lambda env: env.clock), "restore() leads to a different unit"),
+    (variant(picture=lambda env: frame(len(env.seeds))), "reset() with the same seed leads to a "),
+    (variant(picture=lambda env: frame(env.clock), restore=restore_in_order, restored=False),
+     "leads to a different frame"),
+    (variant(picture=lambda env: np.add(env.array, 1, out=env.array),  # the same array every time
+             array=np.zeros((32, 32), np.uint8)), "leads to a different frame"),
+    (stepping(lambda env, *result: (*result[:3], env.clock == 96, {})), "different truncated"),
+    (stepping(lambda env, *result: (*result[:4], {"blank": env.clock % 10 == 0})),
+     "the same action after a restore leads to a different blank"),
+])  # fmt: skip
+def test_the_contract_refuses(env, said):
+    with pytest.raises(InputError, match=re.escape(said)):
+        check_contract(env)
 
 
 def test_the_environment_is_given_as_a_function_and_checked():
@@ -3047,48 +2861,34 @@ def test_the_environment_is_given_as_a_function_and_checked():
     with pytest.raises(InputError, match="lacks reset"):
         envs.make_checked(dict, seed=5)
     assert envs.make_checked(Clocked, seed=5).seeds[-1] == 5
+    assert str(InputError("over\ntwo  lines")) == "over two lines"
 
 
-@pytest.mark.parametrize("at", [59, 75, 90, 100])
-def test_the_contract_finds_a_fault_that_shows_late_and_says_how_many_values_differ(at):
+def test_the_contract_finds_a_fault_that_shows_late_and_says_how_many_values_differ():
+    draws = iter(range(99))  # which no snapshot holds
+
     def restore(env, snapshot):
         env.clock = snapshot[2]
         return Grid.restore(env, snapshot[:2])
 
-    env = showing(
-        lambda env: next(env.draws) if env.clock == at else 0,  # the draws are not in the snapshot
-        draws=iter(range(99)),
+    env = variant(
+        picture=lambda env: frame(257 * next(draws) if env.clock == 100 else 0),
         snapshot=lambda env: bytes([*env.place, env.clock]),
         restore=restore,
     )
-    check_contract(env, steps=at - 20)
-    said = "leads to a different frame than the first time: 2 values differ, the first at (30, 30)"
+    said = "leads to a different frame than the first time: 2 values differ, the first at (0, 0)"
     with pytest.raises(InputError, match=re.escape(said)):
         check_contract(env)
 
 
 def test_a_unit_becomes_a_tuple_of_plain_ints_and_strs():
-    units = (None, 5, "c", ("c", 3), [1, "b"], np.int64(6), np.str_("c"), np.array([1]), (True,))
-    keys = [None, (5,), ("c",), ("c", 3), (1, "b"), (6,), ("c",), (1,), (1,)]
-    found = [unit_key(unit) for unit in units]
-    assert found == keys
-    assert {type(part) for key in found[1:] for part in key} == {int, str}
-
-
-@pytest.mark.parametrize("unit", [0.5, (1, 2.0), np.array([1.0]), {1}, ((1, 2), 3), (None,), b"c"])
-def test_a_unit_of_another_kind_is_refused(unit):
-    with pytest.raises(InputError, match=r"unit\(\) returns .* it must be an int, a str, a tuple"):
-        unit_key(unit)
-
-
-def test_actions_are_whole_numbers_below_the_count(env):
-    last = int(env.action_space.n) - 1
-    before = memory(env)
-    for action in (-1, last + 1, 1.5, None, "A"):
-        with pytest.raises(InputError, match=f"there are actions 0 to {last}, and not {action!r}"):
-            env.step(action)
-    assert memory(env).hex() == before.hex()
-    env.step(np.int64(last))
+    units = [None, 5, ("c", 3), [1, "b"], np.int64(6), np.str_("c"), np.array([1]), (True,)]
+    keys = [unit_key(unit) for unit in units]
+    assert keys == [None, (5,), ("c", 3), (1, "b"), (6,), ("c",), (1,), (1,)]
+    assert {type(part) for key in keys[1:] for part in key} == {int, str}
+    for unit in (0.5, (1, 2.0), {1}, ((1, 2), 3), (None,), b"c"):
+        with pytest.raises(InputError, match="must be an int, a str, a tuple of them, or None"):
+            unit_key(unit)
 
 
 # ------------------------------------------------------------------------------------ the maze
@@ -3102,29 +2902,28 @@ PLAYGROUND = """
     _________# _____^___#
     ########## ##########
 """
-# x, y, facing right, plates as bits: action: the same, and dead, afterwards
-MOVES = """
-    1 0 1 0: NOOP: 1 0 1 0 0      1 0 1 0: LEFT: 1 0 0 0 0      1 0 0 0: LEFT: 0 0 0 0 0
-    0 0 0 0: LEFT: 0 0 0 0 0      1 0 0 0: RIGHT: 1 0 1 0 0     1 0 1 0: RIGHT: 2 0 1 0 0
-    2 0 1 0: RIGHT: 3 3 1 0 1     2 0 1 0: DOWN: 3 3 1 0 1      2 0 0 0: DOWN: 2 0 0 0 0
-    2 0 1 0: A: 4 0 1 0 0         2 0 1 0: B: 2 0 1 0 0         4 0 0 0: A: 2 0 0 0 0
-    5 0 1 0: RIGHT: 6 1 1 0 0     5 0 1 0: DOWN: 6 1 1 0 0      4 0 1 0: A: 6 1 1 0 0
-    6 1 1 0: UP: 7 0 1 0 0        6 1 0 0: UP: 5 0 0 0 0        5 1 1 0: UP: 5 1 1 0 0
-    7 0 1 0: UP: 7 0 1 0 0        1 1 1 0: RIGHT: 1 1 1 0 0     1 1 1 0: A: 1 1 1 0 0
-    1 1 1 0: B: 1 1 1 0 0         1 0 1 0: B: 2 0 1 0 0         1 0 0 0: B: 0 0 0 0 0
-    8 0 1 0: RIGHT: 9 0 1 1 0     8 0 1 0: A: 10 0 1 0 0        7 0 1 0: A: 9 0 1 1 0
-    8 0 1 0: B: 9 0 1 1 0         9 0 1 1: RIGHT: 10 0 1 1 0    14 0 1 0: RIGHT: 15 0 1 0 1
-    14 0 1 0: B: 15 0 1 0 0       15 0 1 0: NOOP: 15 0 1 0 0    15 0 1 0: LEFT: 15 0 0 0 0
-    13 0 1 0: A: 15 0 1 0 1       14 0 1 0: A: 16 2 1 0 1       15 0 1 0: RIGHT: 16 2 1 0 1
-    15 0 1 0: DOWN: 16 2 1 0 0    15 0 1 0: A: 17 0 1 2 0       16 2 1 0: UP: 17 1 1 0 0
-    16 2 0 0: UP: 16 2 0 0 0      17 0 1 2: A: 18 0 1 2 0       18 0 1 3: RIGHT: 18 0 1 3 0
-    12 1 0 0: LEFT: 12 1 0 0 0    12 1 0 1: LEFT: 11 1 0 1 0    12 1 0 2: LEFT: 12 1 0 2 0
-    12 1 0 1: A: 11 1 0 1 0       18 1 1 2: RIGHT: 19 1 1 2 0   18 1 1 1: RIGHT: 18 1 1 1 0
-    18 1 1 0: B: 18 1 1 0 0       18 1 1 2: B: 19 1 1 2 0       19 1 1 2: RIGHT: 19 1 1 2 0
-    8 4 0 0: UP: 7 3 0 0 1        8 4 1 0: UP: 9 3 1 0 0        14 3 1 0: DOWN: 15 4 1 0 1
-    6 3 1 0: A: 8 4 1 0 0         9 3 0 0: DOWN: 8 4 0 0 0      16 3 0 0: B: 16 3 0 0 0
-    6 3 1 0: B: 7 3 1 0 0         6 3 1 0: RIGHT: 7 3 1 0 1     17 1 0 0: A: 16 2 0 0 0
-"""
+
+
+# x, y, facing, plates that are pressed: action: the same afterwards
+RULES = {
+    "LEFT and RIGHT turn, then run": ["1 0 > LEFT 1 0 <", "1 0 > RIGHT 2 0 >"],
+    "walls stop": ["1 1 > RIGHT 1 1 >", "1 1 > A 1 1 >", "1 1 > B 1 1 >", "17 1 < A 16 2 <"],
+    "beyond the level is a wall": ["0 0 < LEFT 0 0 <", "19 1 > b RIGHT 19 1 > b"],
+    "a fall of two rows kills": ["5 0 > RIGHT 6 1 >", "15 0 > RIGHT 16 2 > dead"],
+    "DOWN shortens it by one": ["15 0 > DOWN 16 2 >", "2 0 > DOWN 3 3 > dead"],
+    "DOWN needs an edge": ["2 0 < DOWN 2 0 <"],
+    "UP climbs on the side that is faced": ["6 1 > UP 7 0 >", "6 1 < UP 5 0 <"],
+    "UP needs an opening and a floor": ["5 1 > UP 5 1 >", "16 2 < UP 16 2 <"],
+    "A jumps over a gap and spikes": ["2 0 > A 4 0 >", "6 3 > A 8 4 >"],
+    "A may land in a gap": ["4 0 > A 6 1 >", "14 0 > A 16 2 > dead"],
+    "B steps, but not over an edge": ["1 0 > B 2 0 >", "2 0 > B 2 0 >"],
+    "spikes kill who runs or jumps": ["6 3 > RIGHT 7 3 > dead", "13 0 > A 15 0 > dead"],
+    "spikes kill who falls or climbs": ["14 3 > DOWN 15 4 > dead", "8 4 < UP 7 3 < dead"],
+    "spikes spare who steps or stands": ["6 3 > B 7 3 >", "15 0 > LEFT 15 0 <"],
+    "plates are pressed and latched": ["8 0 > B 9 0 > a", "15 0 > A 17 0 > b"],
+    "plates stay pressed": ["9 0 > a b LEFT 9 0 < a b", "8 0 > b RIGHT 9 0 > a b"],
+    "a plate opens its gate": ["12 1 < b LEFT 12 1 < b", "12 1 < a LEFT 11 1 < a"],
+}
 
 
 @pytest.fixture
@@ -3133,219 +2932,181 @@ def playground(monkeypatch):
     return Maze(4, frame_size=96)
 
 
-@pytest.mark.parametrize("move", re.split(r"\s{2,}", MOVES.strip()))
-def test_the_rules_of_the_maze(playground, move):
-    before, action, after = move.split(":")
-    playground.restore(bytes([4, *map(int, before.split()), 0]))
-    _, reward, terminated, truncated, info = playground.step(getattr(envs, action.strip()))
-    x, y, facing, plates, dead = map(int, after.split())
-    assert list(playground.snapshot()) == [4, x, y, facing, plates, dead]
-    assert (reward, terminated, truncated, info) == (0.0, bool(dead), False, {})
-    room = 2 * (y // 3) + x // 10
-    assert playground.unit() == (None if dead else (room, x % 10, y % 3))
+@pytest.mark.parametrize("rule", RULES)
+def test_the_rules_of_the_maze(playground, rule):
+    for move in RULES[rule]:
+        before, action, after = re.fullmatch("(.*) ([A-Z]+) (.*)", move).groups()
+        snapshots = []
+        for state in (before, after):
+            x, y, facing, *rest = state.split()
+            plates = ("a" in rest) + 2 * ("b" in rest)
+            snapshots.append(bytes([4, int(x), int(y), facing == ">", plates, "dead" in rest]))
+        playground.restore(snapshots[0])
+        outcome = playground.step(getattr(envs, action))[1:]
+        assert list(playground.snapshot()) == list(snapshots[1])
+        assert outcome == (0.0, "dead" in after, False, {})
+        unit = (2 * (int(y) // 3) + int(x) // 10, int(x) % 10, int(y) % 3)
+        assert playground.unit() == (None if "dead" in after else unit)
 
 
-@pytest.mark.parametrize(
-    "level, units, states, depth, deaths",
-    [(1, 187, 970, 82, 16), (2, 258, 4322, 115, 102), (3, 358, 23798, 168, 1614)],
-)
-def test_the_size_of_each_level(level, units, states, depth, deaths):
-    env = Maze(level)
-    steps = env.distances(env.snapshot())
-    assert env.full_coverage == units
-    assert len(steps) == states
-    assert max(steps.values()) == depth
-    assert sum(snapshot[5] for snapshot in steps) == deaths
+def test_the_size_of_each_level():
+    sizes = {}
+    for level in (1, 2, 3):
+        env = Maze(level)
+        steps = env.distances(env.snapshot())
+        deaths = sum(snapshot[5] for snapshot in steps)
+        sizes[level] = (env.full_coverage, len(steps), max(steps.values()), deaths)
+    assert sizes == {1: (187, 970, 82, 16), 2: (258, 4322, 115, 102), 3: (358, 23798, 168, 1614)}
     start = env.snapshot()
     env.step(envs.RIGHT)
-    assert steps[env.snapshot()] == 1
-    assert env.distances(env.snapshot())[start] == 3
+    assert env.distances(env.snapshot())[start] == 3  # turn, run, turn
 
 
 def test_the_level_map_has_a_box_for_each_reachable_unit():
     env = Maze()
     picture, boxes = env.level_map()
     assert picture.shape == (9 * 24, 30 * 8, 3)  # 9 lines of 30 tiles
-    expected = {}
-    for room, column, row in env.reachable():
-        x = 10 * (room % 3) + column
-        y = 3 * (room // 3) + row
-        expected[room, column, row] = (8 * x, 24 * y, 8, 24)
-    assert boxes == expected
-    tiles = envs.LEVELS[1].replace(" ", "").split()
-    floors = [(x, y) for x, y in np.ndindex(30, 9) if tiles[y][x] == "_"]
-    assert {tuple(picture[24 * y + 23, 8 * x].tolist()) for x, y in floors} == {envs.FLOOR}
+    assert boxes.keys() == env.reachable()
+    assert boxes[6, 1, 2] == (8 * 1, 24 * 8, 8, 24)  # where the agent starts
+    assert boxes[8, 4, 1] == (8 * 24, 24 * 7, 8, 24)
+    for y, line in enumerate(envs.LEVELS[1].replace(" ", "").split()):
+        floors = {tuple(picture[24 * y + 23, 8 * x]) for x in range(30) if line[x] == "_"}
+        assert floors == {envs.FLOOR}
 
 
-# level, x, y, facing right, plates, dead: what is wrong with it
-NO_STATES = """
-    3 1 0 1 0 0: another level    4 3 0 1 0 0: in mid-air    4 0 1 1 0 0: in a wall
-    4 11 1 1 2 0: closed gate     4 200 0 1 0 0: no tile     4 1 0 2 0 0: facing 2
-    4 1 0 1 4 0: plate 4          4 1 0 1 0 2: dead 2        4 1 0 1 0: short
-    4 1 0 1 0 0 0: long           0: no state
-"""
-
-
-@pytest.mark.parametrize("state", re.split(r"\s{2,}", NO_STATES.strip()))
-def test_a_snapshot_of_no_state_of_the_maze_is_refused(playground, state):
+@pytest.mark.parametrize("snapshot", [
+    [3, 1, 0, 1, 0, 0],  # another level
+    [4, 3, 0, 1, 0, 0], [4, 0, 1, 1, 0, 0], [4, 11, 1, 1, 2, 0],  # in mid-air, a wall, a gate
+    [4, 200, 0, 1, 0, 0], [4, 1, 0, 2, 0, 0], [4, 1, 0, 1, 4, 0], [4, 1, 0, 1, 0, 2],  # too large
+    [4, 1, 0, 1, 0], [4, 1, 0, 1, 0, 0, 0],  # too short, too long
+])  # fmt: skip
+def test_a_snapshot_of_no_state_of_the_maze_is_refused(playground, snapshot):
     with pytest.raises(InputError, match="no snapshot of maze level 4: "):
-        playground.restore(bytes(map(int, state.split(":")[0].split())))
+        playground.restore(bytes(snapshot))
     assert list(playground.snapshot()) == [4, 1, 0, 1, 0, 0]
-
-
-def test_the_dead_take_no_step(playground):
-    playground.restore(b"\4\1\0\1\3\1")
-    with pytest.raises(InputError, match="dead: reset or restore"):
-        playground.step(envs.NOOP)
 
 
 # ------------------------------------------------------------- the factory, Gymnasium, bad input
 
 
 def test_the_factory_makes_environments_by_name():
-    assert {"maze": Maze, "pop": PrinceOfPersia, "montezuma": Montezuma} == envs.ENVIRONMENTS
     env = make_env("maze", level=2, frame_size=40, frameskip=1)
     assert env.level == 2
     assert env.reset()[0].shape == (40, 40)
-    env = gymnasium.make("RbExploreMaze-v0").unwrapped
-    assert env.level == 1
-    assert env.reset()[0].shape == (32, 32)
+    assert gymnasium.make("RbExploreMaze-v0").unwrapped.reset()[0].shape == (32, 32)
 
 
-@pytest.mark.parametrize(
-    "said, options",
-    [
-        ("unknown environment 'doom': there are maze, pop, montezuma", {"name": "doom"}),
-        ("maze has no option 'speed': it has level, frame_size, frameskip", {"speed": 1}),
-        ("unknown maze level 9: there are 1, 2, 3", {"level": 9}),
-        ("unknown maze level '1'", {"level": "1"}),
-        ("32 pixels or more, not 31", {"frame_size": 31}),
-        ("must be an int, 32 pixels or more, not 32.0", {"frame_size": 32.0}),
-        ("a step of the maze is a whole move: frameskip is 1, not 4", {"frameskip": 4}),
-    ],
-)
-def test_the_factory_refuses_in_one_line(said, options):
+@pytest.mark.parametrize("name, options, said", [
+    ("doom", {}, "unknown environment 'doom': there are maze, pop, montezuma"),
+    ("maze", {"speed": 1}, "maze has no option 'speed': it has level, frame_size, frameskip"),
+    ("maze", {"level": 9}, "unknown maze level 9: there are 1, 2, 3"),
+    ("maze", {"level": "1"}, "unknown maze level '1'"),
+    ("maze", {"frame_size": 31}, "32 pixels or more, not 31"),
+    ("maze", {"frame_size": 32.0}, "must be an int, 32 pixels or more, not 32.0"),
+    ("maze", {"frameskip": 4}, "a step of the maze is a whole move: frameskip is 1, not 4"),
+])  # fmt: skip
+def test_the_factory_refuses_in_one_line(name, options, said):
     with pytest.raises(InputError, match=re.escape(said)):
-        make_env(**{"name": "maze", **options})
+        make_env(name, **options)
 
 
-def test_gymnasium_accepts_every_environment(env):
+def test_every_environment_keeps_the_contract_and_refuses_other_actions(env):
+    env.reset()
+    before = memory(env)
+    check_contract(env)
+    last = int(env.action_space.n) - 1
+    for action in (-1, last + 1, 1.5, None):
+        with pytest.raises(InputError, match=f"there are actions 0 to {last}, and not {action}"):
+            env.step(action)
+    assert memory(env).hex() == before.hex()
+    env.step(np.int64(last))
     check_env(env, skip_render_check=True)
 
 
-def test_the_readings_of_the_cartridge_and_its_clock(prince):
-    names = [*RAM, "blank"]
-    assert prince.reset()[1] == dict(zip(names, (1, 14, 64, 128, 3, 0, False), strict=True))
-    put(prince, level=6, room=23, x=300, y=191, hit_points=5, sword=1)
-    info = prince.step(envs.NOOP)[4]
-    assert info == dict(zip(names, (7, 23, 300, 160, 5, 1, False), strict=True))
-    ram = memory(prince)
-    minutes = [ram[768 + frame] for frame in range(ram[0] - 4, ram[0])]  # as the program sees them
-    assert minutes == 4 * [ord("9")]
-    assert ram[1221:1223] == b"99"
+def test_s_init_is_one_second_after_power_on_and_the_clock_is_held(prince):
+    assert 50 <= memory(prince)[0] <= 60  # frames
+    assert memory(prince)[1221:1223] == b"99"
 
 
 def test_the_readings_of_montezuma(montezuma, capfd):
     env = montezuma()
     assert capfd.readouterr() == ("", "")  # no banner
     assert env.reset()[1] == {"room": 1, "x": 77, "y": 235, "lives": 5, "blank": False}
-    assert env.unit() == (1, 4, 1)
+    units = [env.unit()]
     for _ in range(14):  # down the ladder
-        info = env.step(5)[4]
-    assert (info["x"], info["y"]) == (64, 192)
-    assert env.unit() == (1, 4, 3)
+        env.step(5)
+        units.append(env.unit())
+    assert [units[0], units[-1]] == [(1, 4, 1), (1, 4, 3)]
     assert env.unit_name == "units of 16 x 16 pixels"
 
 
-def test_S6_2_01_S6_2_02_s_init_is_one_frame_after_the_start_state(console, tmp_path):
+@pytest.mark.parametrize("change, said", [
+    ({"rom": None}, "--rom FILE"),
+    ({"rom": "nowhere.nes"}, "cannot read .* No such file"),
+    ({"rom": b"GAME" + bytes(150_000)}, "no complete NES"),
+    ({"rom": b"NES\x1a\x08" + bytes(99)}, "no complete NES"),
+    ({"level": 0}, "levels 1 to 14, not 0"),
+    ({"level": 15}, "levels 1 to 14, not 15"),
+    ({"level": 1.0}, "levels 1 to 14, not 1.0"),
+    ({"level": 2}, "game.nes is not in play on level 2: {"),
+    ({"state": gzip.compress(b"cut")[:9]}, "cannot read"),
+    ({"state": gzip.compress(b"x" * 99)[:10] + b"\xff" * 9}, "cannot read"),
+    ({"state": gzip.compress(b"FCS rubbish")}, "no state of this emulator"),
+    ({"state": gzip.compress(bytes(13339))}, "no state of this emulator"),
+    ({"state": {"level": 5}}, "not in play on level 1, or the state is of another cartridge"),
+    ({"state": {"hit_points": 0}}, "file is not in play on level 1, or the state is of another"),
+])  # fmt: skip
+def test_bad_input_is_one_line_and_leaves_no_emulator(console, tmp_path, change, said):
     env = console()
-    frames = memory(env)[0]
-    assert 50 <= frames <= 60  # the program counts its frames, but for the first few
-    env = console(state=start_state(env, tmp_path / "state"))
-    assert memory(env)[0] == frames + 1
-
-
-@pytest.mark.parametrize(
-    "said, change",
-    [
-        ("--rom FILE", {"rom": None}),
-        ("No such file", {"rom": "nowhere.nes"}),
-        ("no complete NES", {"rom": b"GAME" + bytes(150_000)}),
-        ("no complete NES", {"rom": b"NES\x1a\x08" + bytes(99)}),
-        ("levels 1 to 14, not 0", {"level": 0}),
-        ("levels 1 to 14, not 15", {"level": 15}),
-        ("levels 1 to 14, not 1.0", {"level": 1.0}),
-        ("cannot read .* No such file", {"state": "nowhere"}),
-        ("cannot read .* Not a gzipped file", {"state": b"no gzip"}),
-        ("cannot read", {"state": gzip.compress(b"cut")[:9]}),
-        ("cannot read", {"state": gzip.compress(b"x" * 99)[:10] + b"\xff" * 9}),
-        ("no state of this emulator", {"state": gzip.compress(b"FCS rubbish")}),
-        ("no state of this emulator", {"state": gzip.compress(bytes(13339))}),
-        ("game.nes is not in play on level 2: {", {"level": 2}),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_no_emulator(console, tmp_path, said, change):
-    console().close()
+    file = tmp_path / "file"
     [(name, value)] = change.items()
+    if isinstance(value, dict):
+        value = start_state(env, file, **value)
     if isinstance(value, bytes):
-        (tmp_path / "bad").write_bytes(value)
-        value = str(tmp_path / "bad")
+        file.write_bytes(value)
+        value = str(file)
+    env.close()
+    options = {"rom": str(tmp_path / "game.nes"), name: value}
     with pytest.raises(InputError, match=said) as error:
-        PrinceOfPersia(**{"rom": str(tmp_path / "game.nes"), name: value})
+        PrinceOfPersia(**options)
     assert len(str(error.value).splitlines()) == 1
-    console()
-
-
-@pytest.mark.parametrize("level, hit_points", [(5, 3), (1, 0)])
-def test_a_start_not_in_play_or_a_second_emulator_is_refused(console, tmp_path, level, hit_points):
-    state = start_state(console(), tmp_path / "state", hit_points=hit_points)
-    said = f"not in play on level {level}, or the state is of another cartridge"
-    with pytest.raises(InputError, match=said):
-        console(level=level, state=state)
     console()
     with pytest.raises(InputError, match=r"the emulator refuses .*: close\(\) the first"):
         PrinceOfPersia(str(tmp_path / "game.nes"))
-
-
-def test_a_damaged_snapshot_is_refused(emulator):
-    env = emulator()
-    snapshot = env.snapshot()
-    changed = snapshot[:-1] + bytes([snapshot[-1] ^ 1])
-    for bad in (b"", b"rubbish", None, snapshot[:-1], changed, snapshot + b"x"):
-        with pytest.raises(InputError, match="the snapshot is damaged, or of another game"):
-            env.restore(bad)
-    env.restore(snapshot)
 
 
 def test_a_snapshot_of_another_cartridge_or_level_is_refused(console, tmp_path):
     env = console()
     snapshot = env.snapshot()
     state = start_state(env, tmp_path / "state", level=2)
-    for make in (lambda: console(cartridge(mark=1)), lambda: console(level=2, state=state)):
-        env = make()
+    for options in ({"image": cartridge() + b"x"}, {"level": 2, "state": state}):
         with pytest.raises(InputError, match="or of another game, level or start state"):
-            env.restore(snapshot)
+            console(**options).restore(snapshot)
 
 
-def test_a_closed_emulator_says_so(emulator):
+def test_a_damaged_snapshot_and_a_closed_emulator_are_refused(emulator):
     env = emulator()
     snapshot = env.snapshot()
+    for bad in (b"", b"rubbish", None, snapshot[:-1], snapshot + b"x"):
+        with pytest.raises(InputError, match="the snapshot is damaged, or of another game"):
+            env.restore(bad)
+    env.restore(snapshot)
     env.close()
     env.close()
-    step = functools.partial(env.step, envs.NOOP)
-    restore = functools.partial(env.restore, snapshot)
-    for use in (env.unit, env.snapshot, env.reset, step, restore):
+    for name, *arguments in (["unit"], ["snapshot"], ["reset"], ["step", 0], ["restore", snapshot]):
         with pytest.raises(InputError, match="the emulator is closed"):
-            use()
+            getattr(env, name)(*arguments)
 
 
-@pytest.mark.parametrize("library, name", [("stable_retro", "pop"), ("ale_py", "montezuma")])
-def test_a_missing_library_is_named(tmp_path, monkeypatch, library, name):
-    monkeypatch.setitem(sys.modules, library, None)
-    (tmp_path / "game.nes").write_bytes(cartridge())
-    options = {"rom": str(tmp_path / "game.nes")} if name == "pop" else {}
-    with pytest.raises(InputError, match="pip install " + library.replace("_", "-")):
-        make_env(name, **options)
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "stable_retro", None)
+    monkeypatch.setitem(sys.modules, "ale_py", None)
+    rom = tmp_path / "game.nes"
+    rom.write_bytes(cartridge())
+    with pytest.raises(InputError, match="pip install stable-retro"):
+        make_env("pop", rom=str(rom))
+    with pytest.raises(InputError, match="pip install ale-py"):
+        make_env("montezuma")
 
 
 # ------------------------------------------------------------- the run folder and the command line
