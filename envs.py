@@ -409,13 +409,19 @@ class Maze(PersistentEnv):
 
     def reachable(self) -> set[tuple[int, int, int]]:
         """Every unit that the agent can reach alive, by a search over all states (S5-03)."""
-        states = self._search(self.start)
-        return {self._place(state.x, state.y) for state in states if not state.dead}
-
-    def distances(self, snapshot: bytes) -> dict[bytes, int]:
-        """Snapshot of every state that can be reached from this one -> steps to it."""
-        found = self._search(self._read(snapshot))
-        return {bytes((self.level, *state)): steps for state, steps in found.items()}
+        units = set()
+        found = {self.start}
+        queue = [self.start]
+        for state in queue:  # grows during the loop
+            if state.dead:
+                continue
+            units.add(self._place(state.x, state.y))
+            for action in range(7):
+                after = self._next(state, action)
+                if after not in found:
+                    found.add(after)
+                    queue.append(after)
+        return units
 
     def level_map(self) -> tuple[np.ndarray, dict[tuple, tuple[int, int, int, int]]]:
         """The level in tiles of 8 x 24 pixels with no plate pressed, and the box of each unit."""
@@ -487,20 +493,6 @@ class Maze(PersistentEnv):
         if tile.islower():
             plates |= 1 << self.letters.index(tile)
         return MazeState(x, y, facing, plates, int(crushed or impaled))
-
-    def _search(self, start: MazeState) -> dict[MazeState, int]:
-        """Breadth-first search: every state that can be reached from `start` -> steps to it."""
-        steps = {start: 0}
-        queue = [start]
-        for state in queue:  # grows during the loop
-            if state.dead:
-                continue
-            for action in range(7):
-                after = self._next(state, action)
-                if after not in steps:
-                    steps[after] = steps[state] + 1
-                    queue.append(after)
-        return steps
 
     def _read(self, snapshot: bytes) -> MazeState:
         """The state of a snapshot. Raises InputError for another level or an impossible state."""
@@ -977,7 +969,6 @@ def in_worker(key, env_fn, seed, function, *arguments):
 
 # ---- The factory by name -------------------------------------------------------------------------
 
-gymnasium.register("RbExploreMaze-v0", entry_point=Maze)
 ENVIRONMENTS = {"maze": Maze, "pop": PrinceOfPersia, "montezuma": Montezuma}
 
 

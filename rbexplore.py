@@ -71,7 +71,6 @@ from torch import nn
 from torch.nn import functional as F
 
 from envs import (
-    ENVIRONMENTS,
     InputError,
     PersistentEnv,
     Workers,
@@ -1864,14 +1863,15 @@ class Level(NamedTuple):
     height: int
 
     def show(self, panel, title):
+        """Draw the level, without units, into a panel."""
+        from matplotlib.patches import Rectangle
+
         panel.set_title(title, fontsize=10)
         panel.set(xticks=[], yticks=[], facecolor="0.15", aspect="equal")
         if self.picture is not None:
             panel.imshow(self.picture, extent=(0, self.width, self.height, 0))
         for name, (left, top, w, h) in self.rooms.items():
-            frame_x = [left, left + w, left + w, left, left]
-            frame_y = [top, top, top + h, top + h, top]
-            panel.plot(frame_x, frame_y, color="0.6", linewidth=0.8)
+            panel.add_patch(Rectangle((left, top), w, h, fill=False, color="0.6", linewidth=0.8))
             panel.text(left, top, name[:30], color="white", fontsize=6, va="bottom")
         panel.set(xlim=(0, self.width), ylim=(self.height, 0))
 
@@ -2221,8 +2221,7 @@ def comparison_figures(groups):
         units.update(most.visited())
         settings = runs[0].settings
     figures = {"curves.png": curves_figure(curves, unit_name, pretrain_steps=0)}
-    env_type = ENVIRONMENTS.get(settings.get("env"))
-    env = env_type(settings["level"]) if hasattr(env_type, "level_map") else None
+    env = make_env("maze", level=settings["level"]) if settings.get("env") == "maze" else None
     level = level_of(env, units)
     if level.boxes:
         figures["maps.png"] = maps_figure(level, maps)
