@@ -2324,14 +2324,17 @@ def default_config(env):
 def settings_of(args):
     """The settings of a new run."""
     env = args.env or "maze"
+    method = args.method or "rbexplore"
     base = CONFIGS[args.config] if args.config else default_config(env)
+    if method != "rbexplore":
+        base = replace(base, pretrain_steps=0)  # as in make_method, but before steps are checked
     given = {f.name: getattr(args, f.name) for f in fields(Config)}
     given = {name: value for name, value in given.items() if value is not None}
     level = args.level
     if level is None and env in ("maze", "pop"):
         level = 1
     return {
-        "method": args.method or "rbexplore",
+        "method": method,
         "env": env,
         "level": level,
         "rom": absolute(args.rom),
