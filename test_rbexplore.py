@@ -3378,6 +3378,8 @@ def test_a_run_of_something_else_is_named(tmp_path):
     ("--resume=cells --level=1", "--level cannot be given with --resume"),
     ("--resume=cells --M=4", "--M cannot be given with --resume"),
     ("--resume=cells --threads=1", "--threads cannot be given with --resume"),
+    ("--resume=cells --method=cells", "--method cannot be given with --resume"),
+    ("--resume=cells --config=maze", "--config cannot be given with --resume"),
     ("--verify=random", "random is a run of random, which has no clusters"),
     ("--verify=x --resume=x", "--resume cannot be given with --verify"),
     ("--compare x --steps=9", "--steps cannot be given with --compare"),
