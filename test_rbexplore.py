@@ -1130,12 +1130,13 @@ def test_S4_2_25_merges_if_R_is_greater_than_theta_merge(theta, merged):
     assert merged_chain({(0, 1): 0.7}, theta)[1] == merged
 
 
-@pytest.mark.parametrize("pretraining", [True, False])
-def test_S4_2_25_S6_1_13_S6_3_03_theta_merge_is_a_parameter_of_its_own(pretraining):
+@pytest.mark.parametrize(("pretraining", "theta_sim"), [(True, 0.025), (False, 0.1)])
+def test_S4_2_25_S6_1_13_S6_3_03_theta_merge_is_a_parameter_of_its_own(pretraining, theta_sim):
     for theta_merge, merged in ((0.6, {1: 0}), (0.75, {})):
         a = explorer(theta_merge=theta_merge, theta_sim=0.1)
         a.pretraining = pretraining
         a.coverage.steps = 100  # of 400 of pretraining
+        assert a.theta_sim_now() == pytest.approx(theta_sim)
         a.graph = Graph(State(frame(0), b"0"))
         a.similarity = Stub(table({(0, 1): 0.7}))
         a.iteration = a.config.merge_every
@@ -3323,6 +3324,38 @@ def test_ten_deaths_in_a_row_at_the_first_step_are_reported_and_stop_no_run(tmp_
     why = "truncated: is there a time limit that restore() does not reset?"
     assert [str(report.message) for report in reports] == [f"{said} terminated", f"{said} {why}"]
     assert plain(a.similarity.state_dict()) == before  # R has nothing to learn
+
+
+class Cliff(Grid):
+    """Places 0 to 3 on a cliff. Action 2 jumps, and the step after a jump is death: half of the
+    states cannot be survived."""
+
+    action_space = Discrete(3)
+    full_coverage = None
+
+    def picture(self):
+        return frame(2 * self.place[0] + self.place[1])
+
+    def step(self, action):
+        x, falling = self.place
+        jumps = action == 2
+        self.place = (x if jumps else min(3, max(0, x + 2 * action - 1)), int(jumps))
+        return self.picture(), 0.0, bool(falling), False, {}
+
+    def unit(self):
+        return self.place
+
+
+def test_deaths_at_the_first_step_never_stop_a_run(tmp_path):
+    sizes = {"M": 1000, "n": 1, "N": 1, "trajectory_steps": 2, "additional_steps": 2, "L": 0}
+    a = explorer(Cliff, steps=30_000, pretrain_steps=0, **sizes)
+    a.similarity = Stub(lambda s, s_i: s == s_i)
+    deaths = 0
+    with warnings.catch_warnings(record=True):
+        for iteration in Run(tmp_path, a).begin():
+            deaths += sum(len(t.units) == 1 for t in iteration.trajectories)
+    assert len(a.graph.clusters) == 8
+    assert deaths > 5000
 
 
 def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch):
