@@ -3385,6 +3385,7 @@ def test_a_run_of_something_else_is_named(tmp_path):
     for other, said in (
         (Run(tmp_path, make_method("cells", Grid, TINY)), "method is random there and cells here"),
         (random_run(tmp_path, M=5), "M is 4 there and 5 here"),
+        (random_run(tmp_path, seed=5), "seed is 0 there and 5 here"),
         (random_run(tmp_path, Track), "another environment: its initial state differs"),
         (random_run(tmp_path / "nowhere"), "there is no run in"),
     ):
