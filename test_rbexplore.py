@@ -3246,23 +3246,37 @@ def test_a_lock_is_named_and_released_however_a_run_ends(tmp_path, monkeypatch):
         patch.setattr(Grid, "step", at_call(10, Grid.step, ZeroDivisionError()))
         list(run)
     said = f"in use by another process.* If no process uses it, delete {tmp_path / '.lock'}"
-    with random_run(tmp_path).resume(), pytest.raises(InputError, match=said):
+    with random_run(tmp_path).resume() as holder, pytest.raises(InputError, match=said):
+        list(holder)
         list(run)
     list(run)
     assert random_run(tmp_path).resume().rows == run.rows
 
 
+class Trojan:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
 def test_a_damaged_checkpoint_is_refused(runs, tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
+    torch.save(Trojan(tmp_path / "trojan"), path)
+    trojan = path.read_bytes()
     torch.save(rbexplore.read_checkpoint(runs / "cells") | {"algorithm": {}}, path)
     of_another_version = path.read_bytes()
     content = (runs / "cells" / "checkpoint.pt").read_bytes()
     k = content.index(Maze().reset()[0].tobytes()) + 500
     flipped = content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :]  # one bit, in a frame
-    for damaged in (flipped, of_another_version, content[:3000], b"text"):
+    for damaged in (flipped, of_another_version, content[:3000], b"text", trojan):
         path.write_bytes(damaged)
         said = f"{path} cannot be loaded .*: it is damaged or of another version; start over in"
         assert re.search(said, refused(capsys, "--resume", tmp_path))
+    assert not (tmp_path / "trojan").exists()
 
 
 @pytest.mark.parametrize(("fault", "said"), [
