@@ -1,10 +1,10 @@
 """RbExplore, the algorithm of "Long-Term Exploration in Persistent MDPs" (Ugadiarov, Skrynnik,
 Panov, 2021).
 
-The agent explores without rewards. It clusters the states it visits by a learned similarity R,
-stores a snapshot with each cluster, and rolls the environment back to rarely visited clusters to
-explore from there. One iteration has five steps (section 4), which are the five calls in
-`RbExplore.iterate`:
+The agent explores without rewards. It groups the states it has visited into clusters, using a
+learned similarity R, stores a snapshot with each cluster, and rolls the environment back to rarely
+visited clusters to explore from there. One iteration has five steps (section 4), which are the five
+calls in `RbExplore.iterate`:
 
     1  explore            sample M clusters of G, roll back to each, explore with pi_explore
     2  make_pairs         explore from at most L novel states; label pairs of states
@@ -21,18 +21,18 @@ explore from there. One iteration has five steps (section 4), which are the five
     n, N                Config.n, Config.N           similar: fewer than n steps apart; dissimilar:
                                                      more than N
     G = (V, E)          Graph.clusters, Graph.arcs   clusters, and directed arcs between them
-    v = (s, snap)       Cluster                      a cluster: its centre, a state, and how often
-                                                     it was visited; v, u: numbers of clusters
+    v = (s, snap)       Cluster                      its centre s, the snapshot, and the number of
+                                                     its visits; v, u in the code: cluster numbers
     E_parent            Graph.E_parent               from a cluster to its parent, with the states
                                                      on the way (the prefix)
     theta_sim           Config.theta_sim             a state joins a cluster if R > theta_sim
     theta_merge         Config.theta_merge           two clusters merge if R > theta_merge
     B, beta, L          B, Config.beta, Config.L     the novel states, whose intrinsic reward is
-                                                     above beta; L of them are sampled
+                                                     above beta; at most L of them are sampled
     M                   Config.M                     exploration trajectories per iteration
     pi^p                Graph.actions_to             the actions that lead from s_init to a cluster
     %Cov                Coverage                     the share of the level's units (for example
-                                                     tiles) that were visited; it counts the steps
+                                                     tiles) visited; the class also counts steps
 
 A step of the environment is one action, which an emulator repeats for `frameskip` frames (R1).
 "S4.2-03" is a statement of the paper; `pytest -k S4_2_03` runs its tests. "R13" is our reading of
@@ -90,7 +90,7 @@ def option(default, meaning, low=-math.inf, high=math.inf):
 @dataclass(frozen=True)
 class Config:
     """A configuration. The defaults are the paper's, the same for every level; where it states no
-    value, they follow our readings.
+    value, they are ours.
 
     Raises InputError for values that cannot work."""
 
@@ -99,8 +99,8 @@ class Config:
     pretrain_steps: int = option(500_000, "steps of pretraining, after which G is reset (6.1)", 0)
     M: int = option(30, "exploration trajectories per iteration (6.1)", 1)
     trajectory_steps: int = option(1500, "longest exploration trajectory, steps (6.1, R1)", 1)
-    L: int = option(1000, "most novel states to explore from per iteration (6.1); 0: no RND", 0)
-    additional_steps: int = option(50, "longest additional trajectory, steps: 2N (R3)", 1)
+    L: int = option(1000, "maximum number of novel states to explore from (6.1); 0: no RND", 0)
+    additional_steps: int = option(50, "longest additional trajectory, steps; choose 2N (R3)", 1)
     beta: float = option(2.5, "a state is novel above this intrinsic reward (6.1, R4)")
     n: int = option(5, "similar: states fewer than n steps apart (6.1)", 1)
     N: int = option(25, "dissimilar: states more than N steps apart (6.1)", 1)
@@ -113,7 +113,7 @@ class Config:
     frameskip: int = option(4, "frames of the emulator per step (6.1)", 1, 1000)
     frame_size: int = option(96, "height and width of an observation, pixels (5)", 32, 1024)
     small_networks: bool = option(
-        False, "small encoders (R: instead of ResNet-18, 6.1; RND: of Burda et al.'s)"
+        False, "small encoders, instead of ResNet-18 in R (6.1) and Burda et al.'s in RND"
     )
     embedding: int = option(512, "size of an embedding (6.1), and of RND's output", 1)
     head_width: int = option(512, "width of R's fully connected layers (not in the paper)", 1)
@@ -155,7 +155,7 @@ def check_field(f, value):
         raise InputError(f"{f.name} is {value}: choose a number from {low:,} to {high:,}")
 
 
-# For small images, a small budget and a CPU. What is not listed is as in the paper. n and N are
+# For small images, a small budget and a CPU. Fields not listed keep their defaults. n and N are
 # smaller, because a step of the maze crosses a whole tile (R30).
 MAZE = Config(
     steps=100_000,
@@ -237,8 +237,8 @@ class RbExplore:
         frame, _ = self.env.reset(seed=self.config.seed)
         self.initial_state = State(np.array(frame), self.env.snapshot())
         self.initial_unit = unit_key(self.env.unit())
-        # PyTorch draws default weights from its global generator, which fork_rng leaves untouched
-        # for the caller; `initialise` replaces them.
+        # The layers' default weights come from PyTorch's global generator; fork_rng restores that
+        # generator for the caller, and `initialise` replaces the weights.
         with torch.random.fork_rng(devices=[]):
             self.similarity = SimilarityModel(self.config, frame.shape, device)
             self.rnd = RND(self.config, frame.shape, device)
@@ -259,9 +259,9 @@ class RbExplore:
         self.iteration += 1
         theta_sim = self.theta_sim_now()  # from the steps before this iteration (R21)
         clusters_before = len(self.graph.clusters)
-        # A new generator for each iteration, so that a checkpoint need not store any; and one for
-        # each of the five steps, so that the draws of one do not shift those of another. Step 4
-        # draws nothing.
+        # Each iteration has its own generators, so that a checkpoint need not store any. Each step
+        # that draws (all but step 4) has one of its own, so that its draws do not shift those of
+        # another step.
         rng = np.random.default_rng([self.config.seed, self.iteration])
         rng_1, rng_2, rng_3, rng_5 = rng.spawn(4)
 
@@ -303,8 +303,8 @@ class RbExplore:
 
     def restart(self):
         """End pretraining (6.1; S6.1-15): reset G to the initial state and start counting coverage
-        (R2). R, RND with its statistics, the optimisers and the counts of steps and iterations are
-        kept (R6, R31)."""
+        (R31). R, RND with its statistics, the optimisers and the counts of steps and iterations are
+        kept (R2, R6, R31)."""
         self.pretraining = False
         self.graph = Graph(self.initial_state)
         self.coverage.visit(self.initial_unit)
@@ -347,8 +347,8 @@ class RbExplore:
 
     def make_pairs(self, starts, trajectories, rng):
         """Step 2: label pairs of states within each exploration and each additional trajectory
-        (S4-02), and pairs of a state of an exploration trajectory with one of the full prefix, the
-        states on the way from s_init to the start cluster (S4.1-09, R29). Returns the pairs, the
+        (S4-02). Also pair the states of each exploration trajectory with states of its full prefix,
+        which leads from s_init to the start cluster (S4.1-09, R29). Returns the pairs, the
         additional trajectories, and the intrinsic rewards of the exploration trajectories."""
         additional, novelty = self.explore_from_novel_states(trajectories, rng)
         pairs = []
@@ -363,8 +363,8 @@ class RbExplore:
         return pairs, additional, novelty
 
     def explore_from_novel_states(self, trajectories, rng):
-        """Put all novel states into B, sample L of them, and explore from those (S4.2-15 ...
-        S4.2-18). B holds the novel states of this iteration only (R5). Returns the additional
+        """Put all novel states into B, sample at most L of them, and explore from those (S4.2-15
+        ... S4.2-18). B holds the novel states of this iteration only (R5). Returns the additional
         trajectories, and the intrinsic rewards of the exploration trajectories."""
         if self.config.L == 0:
             return [], []
@@ -380,7 +380,7 @@ class RbExplore:
     def train_similarity(self, pairs, rng):
         """Step 3: train R on the pairs of this iteration only (S4-03, S4-06). Returns metrics: R's
         true positive and true negative rates before the training, and its loss."""
-        # The rates have a generator of their own, so that they do not shift what R draws.
+        # The rates have their own generator, so that they do not shift the draws of R's training.
         true_positive_rate, true_negative_rate = self.similarity.rates(pairs, rng.spawn(1)[0])
         loss = self.similarity.fit(pairs, rng)
         return {"r_tpr": true_positive_rate, "r_tnr": true_negative_rate, "r_loss": loss}
@@ -439,8 +439,8 @@ class State:
 
 @dataclass
 class Trajectory:
-    """tau = (s_1, snap_1), ..., (s_T, snap_T). No step can be taken from a terminal state, so it is
-    not stored (R10); the last state of a truncated episode is."""
+    """tau = (s_1, snap_1), ..., (s_T, snap_T). A terminal state is not stored, because no step can
+    be taken from it (R10); the last state of a truncated episode is stored."""
 
     frames: np.ndarray  # (T, H, W) uint8
     snapshots: list[bytes]  # T
@@ -488,7 +488,8 @@ def roll_back(env, state):
 
 # ------------------------------------------ step 2: training pairs (4.1, 4.2; S4.1-02 ... S4.1-09)
 
-# A pair is a triple (s_1, s_2, y): two frames, and y = 1 if they are similar, else 0 (S4.1-07).
+# A pair is stored with its label as (s_1, s_2, y): s_1 and s_2 are frames, and y = 1 if they are
+# similar, else 0 (S4.1-07).
 # Distances count the states of a trajectory, which are one step apart except across blank screens.
 
 
@@ -600,8 +601,8 @@ class SimilarityModel(nn.Module):
 
     def fit(self, pairs, rng):
         """Minimise the binary cross-entropy in `epochs` passes (R19), each over a new balanced draw
-        of the pairs. Returns the mean loss of the last pass. Without pairs of both classes there
-        are no batches: R is unchanged and the result is None."""
+        of the pairs. Returns the mean loss of the last pass; if one class has no pairs, returns
+        None and leaves R unchanged."""
         self.train()
         try:
             for _ in range(self.epochs):
@@ -623,7 +624,7 @@ class SimilarityModel(nn.Module):
     def rates(self, pairs, rng):
         """The true positive and true negative rates of R > 0.5, over a balanced sample of at most
         1,000 pairs whose frames differ: pairs of identical frames do not show whether R
-        generalises. (None, None) without such pairs of both classes."""
+        generalises. Returns (None, None) if either class has no such pair."""
         differing = [pair for pair in pairs if not np.array_equal(pair[0], pair[1])]
         chosen = balanced(differing, rng)[:1000]
         if not chosen:
@@ -652,8 +653,8 @@ class Cluster(State):
 
 @dataclass(frozen=True)
 class ParentArc:
-    """An arc of E_parent, from a cluster to its parent: the cluster last created on the same
-    trajectory, or the start cluster if there was none (R13)."""
+    """An arc of E_parent, from a cluster v to its parent: the cluster created most recently before
+    v on the same trajectory, or the start cluster if there is none (R13)."""
 
     parent: int
     prefix: np.ndarray  # (k, H, W), from the parent's centre to the cluster's, both included
@@ -669,9 +670,9 @@ class Graph:
         self.clusters: dict[int, Cluster] = {0: initial}  # V
         self.arcs: dict[tuple[int, int], int] = {}  # E: (from, to) -> visits
         self.adjacent: dict[int, set[int]] = {0: set()}  # predecessors and successors (R8)
-        # One arc for each cluster of G but 0, and for its ancestors, merged or not. Merging never
-        # changes an arc of E_parent, so that every full prefix remains a path that was walked; it
-        # drops those that no cluster of G needs (R15).
+        # The arcs of every cluster but 0 and of all its ancestors, even absorbed ones. A merge
+        # changes none of them, so every full prefix remains a path that was walked; it only deletes
+        # the arcs that no cluster of G needs any more (R15).
         self.E_parent: dict[int, ParentArc] = {}
         self.next_number = 1  # of the next cluster; numbers are not reused
         self.embeddings: dict[int, torch.Tensor] = {}  # (d,) of each centre, by the current R
@@ -702,8 +703,8 @@ class Graph:
         embeddings = similarity.embed(tau.frames)  # (T, d)
         clusters = [start]  # the first state is the centre of its start cluster (R9)
         self.clusters[start].visits += 1
-        parent = start  # of the next new cluster (R13)
-        parent_index = 0  # of the parent's centre in tau
+        parent = start  # the parent of the next new cluster (R13)
+        parent_index = 0  # the position of the parent's centre in tau
         for i in range(1, len(tau.frames)):
             previous = clusters[-1]
             v = self.find(embeddings[i], previous, similarity, theta_sim)
@@ -896,8 +897,8 @@ class RND(nn.Module):
         order = rng.permutation(len(states))
         for batch in batches(order, self.batch_size):
             losses.append(self.update(np.stack([states[k] for k in batch])))
-        # Measured after the training: the errors of new states before it are so large that they
-        # would widen the scale and hide the next new states (R4).
+        # Errors are measured after training: before it, those of new states are so large that they
+        # would inflate the standard deviation and hide the novel states of later iterations (R4).
         self.recent_errors.append(np.concatenate([self.errors(frames) for frames in trajectories]))
         return float(np.mean(losses))
 
@@ -938,8 +939,7 @@ class Coverage:
         self.first_visits: dict[tuple, int] = {}  # unit -> step of its first visit
 
     def count(self, unit, covers=True):
-        """Count one step, after which the agent is in `unit`. covers: whether that counts as a
-        visit."""
+        """Count one step that ended in `unit`. covers: whether the unit counts as visited."""
         self.steps += 1
         if covers:
             self.visit(unit)
