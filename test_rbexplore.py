@@ -1742,21 +1742,21 @@ def test_S6_3_02_without_prefixes_the_other_pairs_are_identical():
 
 
 def test_the_metrics_are_what_the_iteration_did():
-    a = explorer(theta_merge=0.4, beta=1.0)
+    a = explorer(theta_merge=0.4, beta=0.2, pretrain_steps=50)
     a.similarity = Stub(lambda s, s_i: 1 / (1 + abs(s - s_i)))
     a.rnd.reward = lambda frames: np.arange(len(frames)) / 10
-    clusters = 1
-    for _ in range(6):
-        was_pretraining = a.pretraining
-        i = a.iterate()
-        m = i.metrics
-        clusters = 1 if was_pretraining != a.pretraining else clusters
-        clusters += m["added"] - len(i.merged)
-        assert (m["clusters"], m["merged"]) == (clusters, len(i.merged))
-        assert (m["additional"], m["steps"]) == (len(i.additional), a.coverage.steps)
-        rewards = np.concatenate(i.novelty)
-        assert m["novel_share"] == np.mean(rewards > 1.0)
-        assert [len(c) for c in i.clusters] == [len(t.frames) for t in i.trajectories]
+    walking(a, [0, 3, 10, 11, 30])  # 11 is near enough to 10 to merge, and not to join
+    found = [a.iterate() for _ in range(4)]
+    names = ("steps", "clusters", "added", "merged", "novel_share", "additional")
+    # 4 trajectories and 3 additional ones, of 4 steps each. Pretraining has two iterations.
+    assert [[i.metrics[name] for name in names] for i in found] == [
+        [28, 1, 0, 0, 0.4, 3],
+        [56, 4, 3, 0, 0.4, 3],
+        [84, 5, 4, 0, 0.4, 3],
+        [112, 4, 0, 1, 0.4, 3],
+    ]
+    assert [len(states) for states in found[0].clusters] == [5] * 4
+    assert [i.merged for i in found] == [{}, {}, {}, {3: 2}]
 
 
 def test_the_seed_makes_the_run_and_global_generators_are_left_alone():
@@ -3115,6 +3115,13 @@ def at_call(k, function, fault):
     return faulty
 
 
+class Moved(Grid):
+    """Starts at another place."""
+
+    def reset(self, *, seed=None, options=None):
+        return self.restore(bytes([1, 0])), {}
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """A folder of runs that are not to be changed. `whole` is one of RbExplore on the grid."""
@@ -3125,6 +3132,7 @@ def runs(tmp_path_factory):
     command(*CELLS, "--steps=801", f"--out={folder / 'steps'}")
     command(*RANDOM, "--no-figures", f"--out={folder / 'random'}")
     random_run(folder / "python").begin()
+    random_run(folder / "start", Moved).begin()
     (folder / "mine").mkdir()
     (folder / "mine" / "metrics.csv").touch()
     return folder
@@ -3267,12 +3275,16 @@ def test_a_damaged_checkpoint_is_refused(runs, tmp_path, capsys):
     path = tmp_path / "checkpoint.pt"
     torch.save(Trojan(tmp_path / "trojan"), path)
     trojan = path.read_bytes()
-    torch.save(rbexplore.read_checkpoint(runs / "cells") | {"algorithm": {}}, path)
+    state = rbexplore.read_checkpoint(runs / "cells")
+    torch.save(state | {"algorithm": {}}, path)
     of_another_version = path.read_bytes()
+    del state["rows"]
+    torch.save(state, path)
+    without_rows = path.read_bytes()
     content = (runs / "cells" / "checkpoint.pt").read_bytes()
     k = content.index(Maze().reset()[0].tobytes()) + 500
     flipped = content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :]  # one bit, in a frame
-    for damaged in (flipped, of_another_version, content[:3000], b"text", trojan):
+    for damaged in (flipped, of_another_version, without_rows, content[:3000], b"text", trojan):
         path.write_bytes(damaged)
         said = f"{path} cannot be loaded .*: it is damaged or of another version; start over in"
         assert re.search(said, refused(capsys, "--resume", tmp_path))
@@ -3434,6 +3446,7 @@ def test_a_run_of_something_else_is_named(tmp_path):
     ("--compare cells level", "cells and level cannot be compared: level is 1 in the one and 2"),
     ("--compare cells steps", "cells and steps cannot be compared: steps is 800 in the one and"),
     ("--compare cells python", "cells and python cannot be compared: env is maze in the one"),
+    ("--compare python start", "python and start cannot be compared: their initial states differ"),
 ])  # fmt: skip
 def test_what_is_refused_is_one_line_and_nothing_is_created(runs, capsys, monkeypatch, words, said):
     monkeypatch.chdir(runs)
