@@ -2346,6 +2346,9 @@ def test_S6_2_05_a_table_has_the_mean_the_range_and_the_median_steps(tmp_path):
     (row,) = compared(tmp_path, *runs).values()
     values = ["rbexplore", "3", "53.3", "20.0 - 90.0", "0 of 3", "400", "-", "-"]
     assert list(row.values()) == values
+    of_three = coverage_of([5, 7, 9])
+    of_three.full = 3
+    assert rbexplore.steps_to(of_three) == {50: 7, 90: 9, 100: 9}
 
 
 def test_S6_2_06_every_group_has_a_map_of_its_best_run_by_final_coverage(tmp_path, monkeypatch):
