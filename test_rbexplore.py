@@ -1985,6 +1985,15 @@ def test_S6_2_03_random_acts_uniformly_in_M_episodes_from_s_init():
     assert len(set(walks)) == 4  # each seed and each iteration draws anew
 
 
+def test_S6_2_03_an_episode_ends_with_a_death_or_a_truncation():
+    a = make_method("random", Grid, AGENT)
+    ended = []
+    for place, action in (((5, 6), 1), ((0, 5), 3), ((3, 3), 1)):
+        a.env.place = place
+        ended.append(a.step(action)[1])
+    assert ended == [True, True, False]
+
+
 @pytest.mark.parametrize(("method", "loss"), [("rnd", "rnd_loss"), ("icm", "forward_loss")])
 def test_S6_2_03_a_bonus_and_its_loss_fall_on_what_was_seen(method, loss):
     a = PPO(Corridor, AGENT, method, "cpu")
@@ -2914,6 +2923,14 @@ def test_the_rules_of_the_maze(playground, rule):
         assert outcome == (0.0, "dead" in after, False, {})
         unit = (2 * (int(y) // 3) + int(x) // 10, int(x) % 10, int(y) % 3)
         assert playground.unit() == (None if "dead" in after else unit)
+
+
+def test_a_frame_shows_place_facing_plates_gates_and_death(playground):
+    # x, y, facing, plates, dead. The first plate is in the first room, its gate in the second.
+    states = [[1, 0, 1, 0, 0], [2, 0, 1, 0, 0], [1, 0, 0, 0, 0], [1, 0, 1, 1, 0], [1, 0, 1, 0, 1]]
+    states += [[12, 1, 1, 0, 0], [12, 1, 1, 1, 0]]
+    frames = {playground.restore(bytes([4, *state])).tobytes() for state in states}
+    assert len(frames) == 7
 
 
 def test_S5_03_S5_04_the_number_of_units_of_each_level():
