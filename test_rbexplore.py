@@ -1173,8 +1173,10 @@ def test_S4_2_28_R14_state_and_snapshot_are_those_of_the_earlier_cluster():
 
 def test_S4_2_29_S4_2_19_R15_every_cluster_still_leads_to_the_initial_one():
     """for any cluster in the graph G, it is possible to construct a sequence of states"""
-    graph, merged = merged_chain({(0, 2): 0.9, (1, 3): 0.9})
-    assert merged == {2: 0, 3: 1}
+    graph, stub = grown([(0, [0, 1, 2, 3, 4])], table({}))
+    assert parents(graph) == {1: 0, 2: 1, 3: 2, 4: 3}
+    stub.R = table({(0, 2): 0.9, (1, 3): 0.9})
+    assert graph.merge(stub, 0.5) == {2: 0, 3: 1}
     assert parents(graph) == {1: 0, 2: 1, 3: 2, 4: 3}  # by way of clusters that merged
     assert numbers(graph.full_prefix(4)) == [0, 1, 2, 3, 4]
 
