@@ -1771,6 +1771,22 @@ def test_the_seed_makes_the_run_and_global_generators_are_left_alone():
     assert np.array_equal(np.random.get_state()[1], before[1])
 
 
+def test_no_two_iterations_draw_alike_be_they_of_one_seed_or_of_neighbouring_seeds():
+    drawn = []
+
+    def walks(states, seeds, limit):
+        drawn.append(tuple(seeds))
+        return [tau([0, 1])] * len(states)
+
+    for seed in (0, 1):
+        a = restarted(seed=seed, L=0)
+        a.similarity = Stub(tens)
+        a.walks = walks
+        a.iterate()
+        a.iterate()
+    assert len(set(drawn)) == 4
+
+
 def test_no_two_networks_start_alike_be_they_of_one_seed_or_of_neighbouring_seeds():
     first_layers = set()
     for seed in (0, 1):
