@@ -2292,6 +2292,12 @@ def parser():
     )
     add("--threads", "CPU threads of PyTorch; changes the rounding (default: 1)", type=count)
     add("--device", "device of the networks: cpu, cuda, cuda:1, ... (default: cpu)")
+    add_fields(p)
+    return p
+
+
+def add_fields(p):
+    """An option for each field of Config."""
     heading = f"In brackets the values of --config {' | '.join(CONFIGS)}, where they differ."
     configuration = p.add_argument_group("configuration", heading)
     for f in fields(Config):
@@ -2302,7 +2308,6 @@ def parser():
             form = {"action": argparse.BooleanOptionalAction}
         meaning = f"[{shown}] {f.metadata['meaning']}"
         configuration.add_argument(flag_of(f.name), default=None, help=meaning, **form)
-    return p
 
 
 def count(text):
